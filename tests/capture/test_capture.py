@@ -12,7 +12,7 @@ from torch.utils import _pytree
 from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.errors import SceneError, ShapeError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, UnitError
 
 WALL = Wall.plane(2.0, 1.6)
 AXIS = TimeAxis(1.0, 0.1, 8)
@@ -72,6 +72,13 @@ def test_peak_time():
     assert peaks.shape == (3, 4) and peaks.dtype == torch.float64
     assert float(peaks[1, 2]) == pytest.approx(1.45)
     assert int(peaks.isnan().sum()) == 11
+
+
+def test_channels_are_a_tuple_of_names():
+    """Files of others could not be read."""
+    for channels in (["red"], "red", (1,)):
+        with pytest.raises(ArgumentError, match="tuple of names"):
+            replace(capture("single"), channels=channels)
 
 
 def test_phasors():

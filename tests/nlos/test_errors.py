@@ -145,6 +145,8 @@ CASES = {
     "no tiles": (lambda: simulate(tiles=0), ArgumentError, "tiles: expected a whole number of at least 1"),
     # what is no capture
     "no scan": (lambda: tt.nlos.simulate(Z), ArgumentError, r"expected scan= beside hidden shapes.*got letter and"),
+    "a mesh and no scan": (lambda: tt.nlos.simulate(([[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[0, 1, 2]])), ArgumentError,
+        "expected scan= beside a mesh"),
     "a scene and a scan": (lambda: simulate(tt.load(complete())), ArgumentError,
         "Leave scan out to simulate the scene"),
     "a scene without a laser": (lambda: scene(without=("laser",)), SceneError, "expected one emitter, the laser"),

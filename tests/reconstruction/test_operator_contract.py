@@ -176,6 +176,8 @@ def test_wrong_operands_are_refused(name):
         operator(torch.zeros(3))
     with pytest.raises(ShapeError, match="real numbers"):
         operator.adjoint(data_of(operator).to(torch.complex128))
+    with pytest.raises(ShapeError, match="empty batch"):
+        operator(torch.zeros(0, *operator.volume_shape))
 
 
 @pytest.mark.slow

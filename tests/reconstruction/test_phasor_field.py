@@ -148,6 +148,8 @@ def test_what_cannot_be_taken():
     of = {"time_axis": AXIS, "pulse": PULSE}
     with pytest.raises(ArgumentError, match="FilteredBackprojection takes points"):
         PhasorField(scan, grid.points, **of)
+    with pytest.raises(ArgumentError, match="expected a DirectLight"):
+        PhasorField(scan, grid, camera="direct", **of)
     with pytest.raises(SceneError, match="one laser spot"):
         PhasorField(scan, grid, camera=TransientCamera([0.1]), **of)
     with pytest.raises(ShapeError, match="with its pitch"):

@@ -77,6 +77,8 @@ def test_what_is_no_grid():
     grid = VoxelGrid.before(SCAN, [0.1])
     with pytest.raises(ShapeError, match="right angles"):
         replace(grid, along_y=grid.along_x)
+    with pytest.raises(ShapeError, match="size and pitch"):
+        replace(grid, size=(2, 3, 4))
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -159,6 +159,8 @@ def test_a_bottle_of_diluted_milk(tmp_path):
 
 @together("make, error", [
     (lambda: meshes.sheet(nlos.outline("T")[::-1]), SceneError),
+    (lambda: meshes.solid([[0, 0], [0, 1], [1, 1]], 0.0, 0.1), SceneError),  # with the clock
+    (lambda: meshes.sheet([[0, 0], [1, 0]]), SceneError),
     (lambda: meshes.subdivided(meshes.plate(1, 1), 9), SceneError), (lambda: meshes.plate(0, 1), UnitError),
     (lambda: scenes.triangle_mesh(np.zeros((3, 2)), [[0, 1, 2]]), ShapeError),
     (lambda: scenes.triangle_mesh(np.zeros((3, 3)), [[0, 1, 3]]), ShapeError),

@@ -247,7 +247,7 @@ def test_what_one_part_refuses_changes_no_other(tmp_path):
         ({"model": wide}, ShapeError, r"expected shape \(1, 3\), the file has \(1, 2\)"),
         ({"model": noise, "noise": model}, StorageError, "no state of a generator|of another module"),
         ({"batches": Batches(10, 5)}, StorageError, "repeat some samples"),
-        ({"other": torch.optim.SGD(model.parameters())}, StorageError, "kind of optimiser, 'Adam'; here is 'SGD'"),
+        ({"other": torch.optim.SGD(model.parameters())}, StorageError, "kind of optimiser, .*Adam'; here is .*SGD'"),
         ({"other": torch.optim.Adam(wide.parameters())}, ShapeError, r"expected shape \(1, 3\), the file has \(1, 2\)"),
         ({"other": torch.optim.Adam(split)}, StorageError, r"groups of \[2\] parameters in the file, here of \[1, 1\]"),
     ):
@@ -348,21 +348,21 @@ def test_states_of_other_kinds_of_optimizers(tmp_path, there, here):
     other = nn.Linear(2, 3)
     optimizer = getattr(torch.optim, here)(other.parameters(), lr=0.5)
     before, weight = optimizer.state_dict(), other.weight.detach().clone()
-    words = f"the state of 'one' is of another kind of optimiser, '{there}'; here is '{here}'"
+    words = rf"the state of 'one' is of another kind of optimiser, '[\w.]+\.{there}'; here is '[\w.]+\.{here}'"
     with pytest.raises(StorageError, match=words):
         load_checkpoint(path, {"model": other, "one": optimizer})
     assert optimizer.state_dict() == before and torch.equal(other.weight, weight)
 
 
 def test_kinds_of_optimizers_with_their_modules(tmp_path):
-    """As files of earlier versions have them."""
+    """Modules of torch move; a class of one's own that is called as torch's has other settings."""
     path, optimizer = tmp_path / "run.pt", torch.optim.Adam(nn.Linear(2, 3).parameters())
     save_checkpoint(path, {"one": optimizer}, step=1)
     content = torch.load(path, weights_only=True)
-    for kind in ("torch.optim.adam.Adam", "__main__.Adam", None):
+    for kind in ("torch.optim.adam.Adam", "torch.optim.moved.Adam", None):
         torch.save({**content, "optimizers": {"one": kind}}, path)
         assert load_checkpoint(path, {"one": optimizer}).step == 1
-    for kind in ("torch.optim.sgd.SGD", 5):
+    for kind in ("torch.optim.sgd.SGD", "__main__.Adam", 5):
         torch.save({**content, "optimizers": {"one": kind}}, path)
         with pytest.raises(StorageError, match="another kind of optimiser"):
             load_checkpoint(path, {"one": optimizer})

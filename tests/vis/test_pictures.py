@@ -274,6 +274,8 @@ def test_gradient_picture(tmp_path):
     (lambda v: v.rainbow(sweep(), axis=AXIS, limits=(3, 3)), UnitError),
     (lambda v: v.peak_time(sweep()[None], AXIS), ShapeError),
     (lambda v: v.plot_overview(sweep(), sweep(), AXIS, path="a.png"), ShapeError),
+    (lambda v: v.plot_overview(sweep(), sweep().sum(1)[:, 1:], AXIS, path="a.png"), ShapeError),
+    (lambda v: v.plot_overview(sweep(), sweep().sum(1), AXIS, path="a.png", errors=sweep()[0, :, 1:]), ShapeError),
     (lambda v: v.plot_overview(sweep(), sweep().sum(1), AXIS, path="a.png", pixel=(6, 0)), ShapeError),
     (lambda v: v.rainbow(sweep(), style="prism"), ArgumentError),
     (lambda v: v.rainbow(sweep(), period_opl=0.0), UnitError), (lambda v: v.streak(sweep(), row=6), ShapeError),

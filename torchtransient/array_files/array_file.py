@@ -39,6 +39,12 @@ from torchtransient.errors import StorageError, TorchTransientError
 CHECKSUMS = "checksums"
 HDF5 = (".h5", ".hdf5")
 ENDINGS = (*HDF5, ".npz")
+# What reads the library's kinds of files.
+_READERS = {
+    "torchtransient result": "torchtransient.files.read_result",
+    "torchtransient capture": "tt.nlos.Capture.read",
+    "torchtransient volume": "tt.nlos.read_volume",
+}
 _PART_BYTES = 2**26
 # What the readers of NumPy and h5py raise for files that are damaged or something else.
 _DAMAGED = (
@@ -108,7 +114,9 @@ def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callab
     with damage_said(source, what):
         found = _format_of(source, what)
         if found not in forms:
-            raise StorageError(f"{what}: expected '{source}' of format {forms[-1]!r}, got {shown(found or 'nothing')}.")
+            kind = (found or "").rpartition(" ")[0]
+            hint = f" {_READERS[kind]} reads it." if kind in _READERS and not forms[-1].startswith(kind) else ""
+            raise StorageError(f"{what}: '{source}' is of format {shown(found or 'nothing')}, not {forms[-1]!r}.{hint}")
         return _values(source, what, known, found)
 
 

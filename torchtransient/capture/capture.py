@@ -16,7 +16,7 @@ from torch import Tensor
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture.scan import Scan, laser_index
 from torchtransient.checks import finite, shown
-from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 from torchtransient.tensor_record import TensorRecord
 
 _CHANNEL_AND_TIME = 2
@@ -47,6 +47,7 @@ class Capture(TensorRecord):
 
     Raises:
         ShapeError: if tensors, scan and axis do not fit, or nothing was measured.
+        ArgumentError: for channels that are no tuple of names.
         StorageError: for metadata that is not plain.
 
     Other leading dimensions are a batch. Measured arrays of numpy and lists become tensors; arrays keep their numbers'
@@ -71,6 +72,8 @@ class Capture(TensorRecord):
     polarized: bool = False
 
     def __post_init__(self) -> None:
+        if not isinstance(self.channels, tuple) or not all(isinstance(name, str) for name in self.channels):
+            raise ArgumentError(f"Capture: expected channels as a tuple of names, got {shown(self.channels)}.")
         for name in ("transient", "phasor", "steady"):
             object.__setattr__(self, name, _measured(name, getattr(self, name)))
         if self.transient is None and self.phasor is None:

@@ -338,7 +338,8 @@ def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
     Raises:
         ShapeError: for anything else.
     """
-    pair = tuple(size) if isinstance(size, Sequence | np.ndarray) else (size, size)
+    given: Any = size
+    pair = tuple(given) if isinstance(given, Sequence) or getattr(given, "ndim", 0) == 1 else (given, given)
     if len(pair) != 2:
         raise ShapeError(f"{who}: expected (nx, ny) or one whole number, got {shown(size)}.")
     nx, ny = (count(f"{who}: size", n, 1, ShapeError) for n in pair)

@@ -42,6 +42,7 @@ _WORDS = {
     "sensors: the scene has": "--sensor: the scene has",
     " to read_capture": "",
     "Give extent=(width, height) in metres": "Give --extent WIDTH,HEIGHT in metres",
+    "expected size= for a list of points": "expected --voxels for a list of points",
 }
 
 

@@ -247,11 +247,15 @@ class AugmentedStream(IterableDataset[Any]):
             None draws from torch's generator.
 
     Raises:
+        ArgumentError: for data sets that are no streams.
         UnitError: for a seed below zero.
         SceneError: for samples without an ``index`` with a seed.
     """
 
     def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
+        # Workers of a DataLoader would each yield all samples of another data set.
+        if not isinstance(dataset, IterableDataset):
+            raise ArgumentError(f"AugmentedStream: expected a stream, got {shown(dataset)}; use Augmented.")
         self.dataset, self.augment, self.seed = dataset, augment, checked_seed("AugmentedStream", seed)
 
     def __iter__(self) -> Iterator[Any]:
@@ -310,10 +314,10 @@ def _size_of(images: Mapping[str, Tensor]) -> tuple[int, int]:
 
 
 def _check_unknown(name: str, given: Any, size: tuple[int, int]) -> None:
-    """Refuse an entry that might be an image: tensors and arrays with two neighbouring dimensions of the image's size,
-    mappings and lists that hold one.
+    """Refuse an entry that might be an image: tensors, arrays and pictures of Pillow with two neighbouring dimensions
+    of the image's size, mappings and lists that hold one.
     """
-    shape = tuple(getattr(given, "shape", ()))
+    shape = np.shape(given) if hasattr(given, "__array_interface__") else tuple(getattr(given, "shape", ()))
     if any(shape[k : k + 2] == size for k in range(len(shape) - 1)):
         raise SceneError(
             f"Augment: {name!r} has the size of an image, {shape}, and nothing says what it is; give "

@@ -14,7 +14,7 @@ from typing import Any
 
 from torchtransient.array_files.hdf5 import hdf5_package
 from torchtransient.array_files.part_files import check_system, sweep_parts
-from torchtransient.checks import a_recipe, count, is_one_of, path_of, positive, shown
+from torchtransient.checks import a_recipe, count, is_one_of, path_of, shown
 from torchtransient.data.crew import Ledger, RunLog, SampleBar
 from torchtransient.data.engines import InProcessCrew, Supervisor, make_on_ray, ray_package
 from torchtransient.data.manifest import build_manifest, fault_of, named_shards, shards_of
@@ -156,7 +156,9 @@ def generate(
     n, retries = _whole("n", n, 1), _whole("retries", retries, 0)
     workers = _whole("workers", workers, int(is_one_of(engine, ("ray",))))
     per_shard = None if per_shard is None else _whole("per_shard", per_shard, 1)
-    timeout_s = None if timeout_s is None else positive(f"{_WHAT}: timeout_s", timeout_s)
+    # Infinity is no limit.
+    if timeout_s is not None and not timeout_s > 0:
+        raise UnitError(f"{_WHAT}: expected timeout_s to be a number above 0, or None, got {shown(timeout_s)}.")
     if shard is not None and not 0 <= shard[0] < shard[1]:
         raise UnitError(f"{_WHAT}: expected shard=(i, k) with 0 <= i < k, got {shown(shard)}.")
     _check_choices(store, compression, engine, address, recipe)

@@ -33,6 +33,8 @@ def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor) -> Tenso
     """
     if not light.is_floating_point():
         raise UnitError(f"spatial_filter: expected a floating dtype, got {light.dtype}; convert it with .float().")
+    if light.ndim < 2:
+        raise ShapeError(f"spatial_filter: expected images (..., H, W), got {tuple(light.shape)}.")
     images = light.reshape(-1, 1, *light.shape[-2:])
     found = []
     for given in torch.split(images, _AT_ONCE):

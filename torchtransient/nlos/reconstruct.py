@@ -185,7 +185,7 @@ def reconstruct(
     Raises:
         ArgumentError: for a method or an option that does not fit the capture or each other.
         StorageError: for a volume beyond the memory.
-        ShapeError, UnitError, DeviceError: as the operators.
+        ShapeError, UnitError: as the operators.
     """
     _, axis = checked_capture(capture, "reconstruct")
     choice = choose_method(capture) if method is None else Choice(method, "asked for")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import math
+import os
 import sys
 import time
 import warnings
@@ -543,6 +544,10 @@ def _scene_work(
         raise ArgumentError(
             "simulate: expected scan= beside hidden shapes, or a complete scene with integrator, laser and sensor, got "
             f"{', '.join(map(str, scene)) or 'nothing'} and no scan. Make one with tt.nlos.Scan.grid(wall, ...)."
+        )
+    if not isinstance(scene, str | os.PathLike | Mapping | Scene):
+        raise ArgumentError(
+            f"simulate: expected scan= beside a mesh, or a complete scene, got {type(scene).__name__} and no scan."
         )
     loaded = load(scene)
     if variant is None and isinstance(scene, Scene):

@@ -155,6 +155,8 @@ class LinearOperator(nn.Module, ABC):
         if tuple(x.shape[x.ndim - len(shape) :]) != shape:
             sizes = ", ".join(map(str, shape))
             raise ShapeError(f"{who}: expected {name} (..., {sizes}), got {tuple(x.shape)}.")
+        if not x.numel():
+            raise ShapeError(f"{who}: expected one {name} at least, got an empty batch {tuple(x.shape)}.")
         if real and x.is_complex():
             raise ShapeError(f"{who}: expected {name} of real numbers, got {x.dtype}. Give its real part or modulus.")
         asking = [key for key, t in (*self.named_parameters(), *self.named_buffers()) if t.requires_grad]

@@ -165,6 +165,7 @@ class PhasorField(ScanOperator):
 
     Raises:
         ShapeError: for other scans (pairs, lists and curved walls go to :class:`FilteredBackprojection`) and grids.
+        ArgumentError: for other objects than a grid and a camera.
         SceneError: for a transient camera without one laser spot.
         UnitError: for quantities out of range.
 
@@ -194,6 +195,10 @@ class PhasorField(ScanOperator):
         pulse.check(points, time_axis.bin_width_opl, "PhasorField")
         check_wavelength(pulse.wavelength, scan, time_axis, "PhasorField")
         self.camera: Camera = DirectLight() if camera is None else camera
+        if not isinstance(self.camera, Camera):
+            raise ArgumentError(
+                f"PhasorField: expected a DirectLight, ConfocalCamera or TransientCamera, got {shown(camera)}."
+            )
         if not self.camera.focuses_laser and scan.kind != "single":
             raise SceneError(
                 f"PhasorField: expected one laser spot for a TransientCamera, got {scan!r}. See capture.single(index)."

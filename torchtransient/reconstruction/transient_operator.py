@@ -15,6 +15,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.capture import precision_of
+from torchtransient.checks import arguments_of
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction.capture_checks import (
     check_from_zero,
@@ -192,7 +193,8 @@ def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who:
     """
     transient, axis = checked_capture(capture, who)
     options.setdefault("dtype", precision_of(transient))
-    operator = kind(capture.scan, *points, time_axis=axis, **options).to(transient.device)
+    with arguments_of(who, kind.__init__, ("scan", "time_axis")):
+        operator = kind(capture.scan, *points, time_axis=axis, **options).to(transient.device)
     volume: Tensor = operator.reconstruct(capture)
     return volume
 

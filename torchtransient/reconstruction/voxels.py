@@ -182,6 +182,8 @@ class VoxelGrid:
         depths = checked_depths(self.depths, "VoxelGrid")
         size = tuple(count("VoxelGrid: size", n) for n in self.size)
         pitch = tuple(positive("VoxelGrid: pitch", p) for p in self.pitch)
+        if len(size) != 2 or len(pitch) != 2:
+            raise ShapeError(f"VoxelGrid: expected size and pitch along (Y, X), got {size} and {pitch}.")
         for name, value in {"depths": depths, "size": size, "pitch": pitch}.items():
             object.__setattr__(self, name, value)
         for name in ("first", "along_x", "along_y", "normal"):
@@ -474,7 +476,9 @@ class HiddenVolume(TensorRecord):
 def _check_volume(volume: HiddenVolume) -> None:
     """Raise ShapeError unless values, times and directions are real and fit the grid and each other."""
     frames = () if volume.times is None else tuple(volume.times.shape)
-    if volume.times is not None and (len(frames) != 1 or not bool(torch.isfinite(volume.times).all())):
+    if volume.times is not None and (
+        len(frames) != 1 or volume.times.is_complex() or not bool(torch.isfinite(volume.times).all())
+    ):
         error = UnitError if len(frames) == 1 else ShapeError
         raise error(f"HiddenVolume: expected finite times (N,) in metres of optical path, got {volume.times}.")
     _check_values("values", volume.values, (*frames, *volume.grid.shape))

@@ -181,8 +181,11 @@ def triangulated(outline: Vertices) -> Faces:
         outline: corners (N, 2), against the clock.
 
     Raises:
-        SceneError: for an outline of which no ear can be cut.
+        SceneError: for an outline with the clock or without an area, and one of which no ear can be cut.
     """
+    x, y = outline.T
+    if not float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) > 0:
+        raise SceneError("outline: expected corners against the clock, with x to the right and y up")
     left, triangles = list(range(len(outline))), []
     while len(left) > 3:
         for k in range(len(left)):

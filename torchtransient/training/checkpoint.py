@@ -149,6 +149,10 @@ _OF_SHAPE = (
 )  # fmt: skip
 
 
+def _kind_of(optimizer: torch.optim.Optimizer) -> str:
+    return f"{type(optimizer).__module__}.{type(optimizer).__name__}"
+
+
 def check_optimizer(name: str, optimizer: torch.optim.Optimizer, state: Any, kind: str | None) -> None:
     """Check a state of an optimiser, and change nothing.
 
@@ -156,7 +160,7 @@ def check_optimizer(name: str, optimizer: torch.optim.Optimizer, state: Any, kin
         name: name of the part.
         optimizer: optimiser of torch.
         state: state that is to be loaded.
-        kind: name of the class that has written it, None if unknown.
+        kind: class that has written it, with its module, None if unknown.
 
     Raises:
         StorageError, ShapeError: for a state of another kind, or of other groups or shapes.
@@ -165,11 +169,12 @@ def check_optimizer(name: str, optimizer: torch.optim.Optimizer, state: Any, kin
     entries = state.get("state") if isinstance(state, dict) else None
     if not isinstance(groups, list) or not isinstance(entries, dict):
         raise StorageError(f"load_checkpoint: the part {name!r} is no state of an optimiser.")
-    # Files of earlier versions have the module before the name.
-    if kind is not None and str(kind).rpartition(".")[2] != type(optimizer).__name__:
+    # Modules move from version to version, but an Adam of one's own is not torch's.
+    mine, theirs = ((one.startswith("torch."), one.rpartition(".")[2]) for one in (_kind_of(optimizer), str(kind)))
+    if kind is not None and mine != theirs:
         raise StorageError(
             f"load_checkpoint: the state of {name!r} is of another kind of optimiser, {shown(kind)}; here is "
-            f"{type(optimizer).__name__!r}."
+            f"{_kind_of(optimizer)!r}."
         )
     here = [len(group["params"]) for group in optimizer.param_groups]
     there = [len(group["params"]) for group in groups]
@@ -260,7 +265,8 @@ def save_checkpoint(
     own = _written(place, content) if _rank() == 0 else None
     failure = _told_by_first(None if own is None else str(own))
     if failure is not None:
-        raise StorageError(f"save_checkpoint: {place} cannot be written: {failure}") from own
+        reason = failure.removeprefix("save_checkpoint: ")
+        raise StorageError(f"save_checkpoint: {place} cannot be written: {reason}") from own
 
 
 def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:
@@ -325,7 +331,7 @@ def _content(parts: Mapping[str, Any], step: int, values: Mapping[str, Any] | No
         "version": _VERSION,
         "step": count("save_checkpoint: step", step, 0, UnitError),
         "parts": {name: _state_of(name, part) for name, part in parts.items()},
-        "optimizers": {n: type(one).__name__ for n, one in parts.items() if isinstance(one, torch.optim.Optimizer)},
+        "optimizers": {n: _kind_of(one) for n, one in parts.items() if isinstance(one, torch.optim.Optimizer)},
         "values": plain(dict(values or {}), "values"),
         "libraries": _libraries(),
     }

@@ -144,6 +144,11 @@ def plot_overview(
     """
     transient, steady = _on_axis(transient, axis, "plot_overview"), torch.as_tensor(steady)
     size = (transient.shape[-2], transient.shape[-1])
+    if steady.shape != (len(transient), *size) or (errors is not None and errors.shape != transient.shape[1:]):
+        raise ShapeError(
+            f"plot_overview: expected steady (C, H, W) and errors (T, H, W) of the transient {tuple(transient.shape)}, "
+            f"got {tuple(steady.shape)} and {None if errors is None else tuple(errors.shape)}."
+        )
     pixel = pixel_of(_median_pixel(steady) if pixel is None else pixel, size, "plot_overview")
     figure = figure_type()(figsize=(12.0, 7.4), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False).flat

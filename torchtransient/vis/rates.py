@@ -98,7 +98,7 @@ def _rates_of(
     if axis is None or rate_axis is None:
         raise ShapeError(f"{who}: light without its own axes needs axis=TimeAxis(...) and rate_axis=RateAxis(...).")
     light = as_tensor(held, who)
-    if light.ndim != 5 or tuple(light.shape[1:3]) != (rate_axis.num_bins, axis.num_bins):
+    if light.ndim != 5 or light.is_complex() or tuple(light.shape[1:3]) != (rate_axis.num_bins, axis.num_bins):
         raise ShapeError(
             f"{who}: expected light (C, {rate_axis.num_bins}, {axis.num_bins}, H, W) as the axes have it, got "
             f"{tuple(light.shape)}; of a batch, choose one entry."

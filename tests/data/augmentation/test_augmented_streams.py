@@ -132,6 +132,7 @@ def test_an_epoch_is_one_of_the_data_set_too(data):
     ("call", "error", "message"),
     [
         (lambda data: Augmented(TransientStream(data), Augment(Flip())), ArgumentError, "AugmentedStream"),
+        (lambda data: AugmentedStream(TransientDataset(data), Augment(Flip())), ArgumentError, "use Augmented"),
         (lambda data: Augmented([1], Augment(Flip()), seed=-1), UnitError, "seed"),
         (lambda data: Augmented([1], Augment(Flip()), seed=0).sample(0, -1), UnitError, "epoch"),
         (lambda data: Augmented([1, 2], Augment(Flip()))[2], IndexError, "from 0 to 1"),

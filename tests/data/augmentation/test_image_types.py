@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.augmentation import RandomAffine
+from PIL import Image
 
 from support.sweeps import together
 from torchtransient.data import (
@@ -180,6 +181,7 @@ DEPTH = {"depth": torch.ones(H, W)}
 @together(
     "call, error, message",
     [
+        (lambda: Augment(Flip())({**DEPTH, "mask": Image.new("L", (W, H))}), SceneError, "size of an image"),
         (lambda: Augment(Given(SHIFT, seen=(2, 2)))(DEPTH), ShapeError, r"2, 2\), got \(4, 6\)"),
         (lambda: PixelMap([[1, 0, 0], [0, 1, 0], [0.1, 0, 1]], (2, 2), (2, 2)), ShapeError, "affine matrix"),
         (lambda: PixelMap(np.diag([0.0, 1, 1]), (2, 2), (2, 2)), UnitError, "with an inverse"),
@@ -232,5 +234,7 @@ def test_gradients_and_empty():
 def test_what_a_filter_refuses():
     with pytest.raises(UnitError, match="floating dtype"):
         spatial_filter(FILTERS["median"], torch.ones(3, 4, 4, dtype=torch.complex64))
+    with pytest.raises(ShapeError, match=r"images \(..., H, W\), got \(4,\)"):
+        spatial_filter(FILTERS["median"], torch.ones(4))
     with pytest.raises(ShapeError, match=r"to make images \(3, 1, 4, 4\), got \(1, 4, 4\)"):
         spatial_filter(lambda x: x[0], torch.ones(3, 4, 4))
