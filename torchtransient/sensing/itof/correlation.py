@@ -509,7 +509,7 @@ class ItofCorrelation(Sensor):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
         """Take phases of another size with the state; refuse the weights of another camera."""
         phases, given = (state_dict.get(prefix + name) for name in ("phases_rad", "weights"))
-        if isinstance(phases, Tensor) and len(phases) == len(self.frequencies_hz) and not self._learnt:
+        if isinstance(phases, Tensor) and phases.shape[:-2] == (len(self.frequencies_hz),) and not self._learnt:
             self.phases_rad = phases.detach().to(self.weights.device, copy=True)
             self.weights = self._weights().to(self.weights)
         own = self.weights
