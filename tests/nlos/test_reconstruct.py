@@ -103,8 +103,6 @@ def test_mistakes_have_types(tmp_path):
     ):  # fmt: skip
         with pytest.raises(error, match=message):
             tt.nlos.reconstruct(capture, **arguments)
-    with pytest.raises(ArgumentError, match="HiddenVolume"):
-        tt.nlos.write_volume(tmp_path / "a.h5", capture)
     with pytest.raises(StorageError, match="volume"):
         tt.nlos.read_volume(capture.write(tmp_path / "capture.npz"))
     with pytest.raises(ShapeError, match="directions"):
