@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -49,6 +50,17 @@ _HASHED_BYTES = 2**22
 _TEXTS = ("format", "store", "compression")
 
 
+def _opened(path: Path) -> Any:
+    """Open a shard, whose writer still holds its lock for a moment when the file appears."""
+    h5py = hdf5_package(WHAT)
+    for wait_s in (0.01, 0.1, 1.0):
+        try:
+            return h5py.File(path, "r", rdcc_nbytes=0)
+        except BlockingIOError:
+            time.sleep(wait_s)
+    return h5py.File(path, "r", rdcc_nbytes=0)
+
+
 class Shard:
     """Open shard, a context manager. Handles belong to one process.
 
@@ -67,8 +79,7 @@ class Shard:
         self._datasets: dict[str, Any] = {}
         self._values: dict[str, NDArray[Any]] = {}
         with damage_said(self.path, WHAT):
-            # Shards do not change: no lock, which their writer still holds for a moment when they appear.
-            self._file = hdf5_package(WHAT).File(self.path, "r", rdcc_nbytes=0, locking=False)
+            self._file = _opened(self.path)
         try:
             with damage_said(self.path, WHAT):
                 self._read_about()

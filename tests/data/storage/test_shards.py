@@ -4,6 +4,7 @@ damaged or made to harm give StorageError, in little memory, and read nothing el
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import hashlib
 import json
@@ -11,6 +12,7 @@ import os
 import resource
 import sys
 import tempfile
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -175,6 +177,16 @@ def test_a_shard_that_is_there_is_replaced_at_the_end(tmp_path):
         assert found.value is error and digest(path) == before and list(tmp_path.iterdir()) == [path]
     write(path, [sample(1)])
     assert digest(path) != before and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_shard_is_read_beside_its_writer_and_other_readers(tmp_path):
+    """A lock that is held for a moment is waited for, and other readers of HDF5 read it too."""
+    write(tmp_path / "a.h5", [sample(0), sample(1)])
+    with open(tmp_path / "a.h5", "rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        threading.Timer(0.05, fcntl.flock, (held, fcntl.LOCK_UN)).start()
+        with Shard(tmp_path / "a.h5") as shard, h5py.File(tmp_path / "a.h5", "r") as file:
+            assert list(file["index"]) == list(shard.index)
 
 
 def test_windows_and_pixels(tmp_path):
