@@ -80,9 +80,9 @@ def test_polarization_and_phasors_from_files(folder, result):
     import numpy as np
 
     values = torch.rand(4, 1, 3, 5, 5).numpy()
-    np.savez("polarized.npz", transient=values)
-    np.savez("phasor.npz", phasor=(values[0] + 1j * values[1]).astype(np.complex64))
-    for name, kind in (("polarized.npz", "polarization"), ("phasor.npz", "phasor")):
+    np.save("polarized.npy", values)
+    np.save("phasor.npy", (values[0] + 1j * values[1]).astype(np.complex64))
+    for name, kind in (("polarized.npy", "polarization"), ("phasor.npy", "phasor")):
         done = run("picture", name, f"{kind}.png", "--kind", kind)
         assert done.exit_code == 0, done.output
         assert Image.open(f"{kind}.png").size[0] > 300
@@ -109,7 +109,7 @@ def test_gates_become_frames(folder):
     gates = "gaussian 8 0.5; gaussian 8.5 0.5; gaussian 9 0.5"
     done = run("render", "box.xml", "-o", "gated.h5", "--gates", gates, "--video", "gates.gif", "--quiet")
     assert done.exit_code == 0, done.output
-    assert Image.open("gates.gif").n_frames == 3 and "gates.gif: 3 frames, one for each gate" in done.stdout
+    assert Image.open("gates.gif").n_frames == 3 and "gates.gif: 3 frames" in done.stdout
     assert run("picture", "gated.h5", "frames.png", "--kind", "frames").exit_code == 0
     done = run("picture", "gated.h5", "none.png", "--kind", "rainbow")
     assert done.exit_code == 2 and "gates" in done.stderr and not (folder / "none.png").exists()

@@ -13,13 +13,12 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import StorageError
-from torchtransient.files.captures.formats import ENDINGS as ENDINGS_OF
 from torchtransient.files.captures.formats import LAYOUTS
 from torchtransient.files.captures.matlab import write_mat as write_mat
 from torchtransient.nlos import HiddenVolume, VoxelGrid
 
 # Endings of files by layout, and the layouts that are written.
-ENDINGS = {"torchtransient": ".h5"} | {name: endings[0] for name, endings in ENDINGS_OF.items()}
+ENDINGS = {"torchtransient": ".h5"} | {name: layout.ENDINGS[0] for name, layout in LAYOUTS.items()}
 WRITTEN = ["torchtransient", *(name for name, layout in LAYOUTS.items() if hasattr(layout, "write"))]
 
 AXIS = TimeAxis(1.1, 0.003, 7)

@@ -14,6 +14,7 @@ from torchtransient.files.captures.contents import Contents
 from torchtransient.files.captures.gaps import Gaps, flat_scan, grid_points, numbers_in, tensor_of, time_axis
 
 NAME = "cdt"
+ENDINGS = (".mat",)
 BIN_WIDTH_S, SLAB_BIN_WIDTH_S = 16e-12, 8e-12
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.array_files.array_file import array_of, replacing
+from torchtransient.array_files.array_file import HDF5, array_of, replacing
 from torchtransient.array_files.hdf5 import new_hdf5, write_parts
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import WHAT, Contents
@@ -27,6 +27,7 @@ from torchtransient.files.captures.gaps import (
 )
 
 NAME = "dirac"
+ENDINGS = HDF5
 _REQUIRED = {"data_t", "xg", "yg", "da", "offset_laser"}
 _KEPT = ("offset_laser", "offset_camera", "sample_x", "sample_y")
 _KNOWN = {*_REQUIRED, *_KEPT, "xa", "ya"}

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from torchtransient.array_files.array_file import HDF5, check_folder, damage_said, path_of
+from torchtransient.array_files.array_file import check_folder, damage_said, path_of
 from torchtransient.array_files.hdf5 import hdf5_package, read_attributes
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
@@ -20,17 +20,12 @@ from torchtransient.files.captures.contents import WHAT, Contents, opened
 from torchtransient.files.captures.gaps import Gaps
 
 OWN = "torchtransient"
-_MAT = (".mat",)
-
-
-# Modules with `NAME`, `recognises(contents)`, `read(contents, gaps)`, and, unless they are only read,
-# `write(target, capture)`. In the order in which they are tried: names of variables that say most come first.
-_MODULES = (tal, zaragoza, dirac, phasor_field, keyhole, rect_data, cdt, tmf8828, vl53l8)
+# Modules with `NAME`, `ENDINGS` of the files, `recognises(contents)`, `read(contents, gaps)`, and, unless they are only
+# read, `write(target, capture)`. In the order in which they are tried: names of variables that say most come first.
+_MODULES = (
+    tal, zaragoza, dirac, phasor_field, keyhole, rect_data, cdt, tmf8828, vl53l8,
+)  # fmt: skip
 LAYOUTS: dict[str, ModuleType] = {module.NAME: module for module in _MODULES}
-ENDINGS = {
-    "tal": HDF5, "zaragoza": HDF5, "dirac": HDF5, "phasor_field": _MAT, "keyhole": _MAT, "rect_data": _MAT,
-    "cdt": _MAT, "tmf8828": (".json",), "vl53l8": (".npz",),
-}  # fmt: skip
 FORMATS = (OWN, *LAYOUTS)
 
 
@@ -118,8 +113,8 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
     if metadata is not None:
         raise StorageError(f"{WHAT}: metadata= is for the library's own format; got it with format={format!r}.")
     target = path_of(path, WHAT)
-    if target.suffix.lower() not in ENDINGS[format]:
-        endings = ", ".join(ENDINGS[format])
+    if target.suffix.lower() not in LAYOUTS[format].ENDINGS:
+        endings = ", ".join(LAYOUTS[format].ENDINGS)
         raise StorageError(f"{WHAT}: expected a name that ends in {endings} for format={format!r}, got '{target}'.")
     check_folder(target, WHAT)
     layout.write(target, capture)

@@ -15,6 +15,7 @@ from torchtransient.files.captures.contents import Contents
 from torchtransient.files.captures.gaps import Gaps, flat_scan, numbers_in, tensor_of, time_axis
 
 NAME = "keyhole"
+ENDINGS = (".mat",)
 BIN_WIDTH_S = 16e-12
 _OTHERS = ("LongExpNoObject_before", "LongExpNoObject_after", "direct_before", "direct_after")
 

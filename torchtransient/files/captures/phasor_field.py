@@ -33,6 +33,7 @@ from torchtransient.files.captures.gaps import (
 from torchtransient.files.captures.matlab import write_mat
 
 NAME = "phasor_field"
+ENDINGS = (".mat",)
 _VOLUME = {"minimalpos": 3, "maximalpos": 3, "sampling_grid_spacing": 1}
 _REQUIRED = {"data", "laserPos", "cameraPos", "deltat"}
 _FIELDS = {*_REQUIRED, "laserNorm", "cameraNorm", "laserOrigin", "cameraOrigin", "t", "t0"}

@@ -36,6 +36,7 @@ from torchtransient.files.captures.matlab import write_mat
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 NAME = "rect_data"
+ENDINGS = (".mat",)
 _OFF_GRID = 1e-3
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient.array_files.array_file import array_of, replacing
+from torchtransient.array_files.array_file import HDF5, array_of, replacing
 from torchtransient.array_files.hdf5 import hdf5_package, new_hdf5, write_parts
 from torchtransient.array_files.plain_texts import read_plain_yaml, write_plain_yaml
 from torchtransient.axes import FrequencyAxis
@@ -46,6 +46,7 @@ from torchtransient.plugins.films.transform_bins import transform_bins
 Kind = TypeVar("Kind", int, bool)
 
 NAME = "tal"
+ENDINGS = HDF5
 _STOKES = 4
 _LEGS = "t_accounts_first_and_last_bounces"
 # Numbers whose kinds a file that is written of a capture has again.

@@ -24,6 +24,7 @@ from torchtransient.files.captures.contents import Contents, JsonContents
 from torchtransient.files.captures.gaps import Gaps, numbers_in, scan_of, tensor_of, time_axis, zone_grid
 
 NAME = "tmf8828"
+ENDINGS = (".json",)
 BIN_WIDTH_S, ZERO_BIN = 93.0e-12, 13.56
 # Tangents of half the field of view along the chip's x (from row to row of zones) and y (from column to column), which
 # zones divide evenly: which way they run is a guess.

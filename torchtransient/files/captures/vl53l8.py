@@ -23,6 +23,7 @@ from torchtransient.files.captures.gaps import (
 )
 
 NAME = "vl53l8"
+ENDINGS = (".npz",)
 BIN_WIDTH_S = 250e-12
 _KNOWN = {"hists", "pt_cloud", "cam_z"}
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.array_files.array_file import array_of, replacing
+from torchtransient.array_files.array_file import HDF5, array_of, replacing
 from torchtransient.array_files.hdf5 import new_hdf5, write_parts
 from torchtransient.capture import Capture
 from torchtransient.checks import shown
@@ -35,6 +35,7 @@ from torchtransient.files.captures.gaps import (
 )
 
 NAME = "zaragoza"
+ENDINGS = HDF5
 _REQUIRED = {"data", "cameraGridPositions", "laserGridPositions", "deltaT"}
 _GRID = ("Positions", "Normals", "Points", "Size")
 _VOLUME = ("hiddenVolumePosition", "hiddenVolumeRotation", "hiddenVolumeSize")
