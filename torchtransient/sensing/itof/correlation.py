@@ -511,8 +511,7 @@ class ItofCorrelation(Sensor):
         phases, given = (state_dict.get(prefix + name) for name in ("phases_rad", "weights"))
         if isinstance(phases, Tensor) and phases.shape[:-2] == (len(self.frequencies_hz),) and not self._learnt:
             self.phases_rad = phases.detach().to(self.weights.device, copy=True)
-            self.weights = self._weights().to(self.weights)
-        own = self.weights
+        own = self.weights = self._weights().to(self.weights)
         if isinstance(given, Tensor) and given.shape == own.shape:
             # as much as rounding to their dtype leaves
             slack = 4 * max(torch.finfo(given.dtype).eps, torch.finfo(own.dtype).eps, 1e-9)
