@@ -60,13 +60,8 @@ def test_sums_have_the_error_that_is_claimed(sampler, errors):
     assert (found > 0.3).all() and (found < 1.9).all()
 
 
-@pytest.mark.parametrize(
-    "errors, size, starts",
-    [
-        pytest.param("bins", 10, (5, 15, 25), marks=pytest.mark.soak),
-        pytest.param(True, 8, (8, 16, 24), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.soak
+@pytest.mark.parametrize("errors, size, starts", [("bins", 10, (5, 15, 25)), (True, 8, (8, 16, 24))])
 def test_calibration(errors, size, starts):
     """Of 12 regions, 200 runs: 1 +- .1. A mean of 2400 squares deviates by .03 if they are normal, and these have
     heavier tails. Of cells of 8 bins a window that begins within one takes the variance of its neighbours, too.

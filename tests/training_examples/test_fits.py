@@ -303,7 +303,7 @@ def test_the_judge_finds_delay_gain_and_background():
 FIT, BASELINE = "fit, with what is left over", "neighbours, shifted"
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_simulated_chip_is_predicted(tmp_path, monkeypatch):
     monkeypatch.delenv("TORCHTRANSIENT_MEASURED_DATA", raising=False)
     (rows,) = small_run("fit_measured_histograms", tmp_path)

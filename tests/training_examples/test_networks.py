@@ -87,8 +87,13 @@ def test_measured_captures_lose_their_noise(tmp_path):
 # ------------------------------------------------------------------------------------------------- depths and speeds
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("way", [pytest.param([], id="on disk"), pytest.param(["--online"], id="online")])
+@pytest.mark.parametrize(
+    "way",
+    [
+        pytest.param([], id="on disk", marks=pytest.mark.slow),
+        pytest.param(["--online"], id="online", marks=pytest.mark.soak),
+    ],
+)
 def test_depth_from_counts(tmp_path, way):
     (errors,) = small_run("depth_from_counts", tmp_path, *way)
     # It begins as the filter that it corrects.
@@ -132,7 +137,7 @@ def test_multipath_is_no_speed(tmp_path):
 # ------------------------------------------------------------------------------------ network and renderer together
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_renderer_corrects_the_network(tmp_path):
     module = example("amortised")
     table = small_run("amortised", tmp_path, "--seeds", 0)
@@ -143,7 +148,7 @@ def test_the_renderer_corrects_the_network(tmp_path):
     assert table.percent("renderer from the truth, 512 spp") < 0.5 * hybrid
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_counter_and_scenes_are_learnt_together(tmp_path):
     table = small_run("self_calibration", tmp_path, "--seeds", 0)
     assert table.percent(example("self_calibration").TOGETHER) < table.percent("network, wrong counter")

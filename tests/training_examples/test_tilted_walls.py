@@ -83,7 +83,7 @@ def test_two_ranks_one_of_which_is_killed_learn_what_one_learns(tmp_path):
     assert (tmp_path / "two" / "train_ddp.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_lightning_goes_on_to_the_bit_and_learns_the_same(tmp_path):
     pytest.importorskip("lightning")
     script = example("lightning_fit")
