@@ -9,14 +9,12 @@ import h5py
 import numpy as np
 import pytest
 
-from support.capture_files import holdable
+from support.capture_files import ENDINGS, holdable
 from torchtransient.axes import FrequencyAxis
-from torchtransient.files.captures.formats import ENDINGS as ENDINGS_OF
 from torchtransient.files.captures.formats import read_capture
 
 pytestmark = pytest.mark.peer
 
-ENDINGS = {name: endings[0] for name, endings in ENDINGS_OF.items()}
 # y-tal finds axes by equal sizes, reads one camera point, and grids with a fixed point.
 NOT_READ_THERE = {"zaragoza-confocal", "phasor_field-exhaustive", "rect_data-confocal"}
 HOLDABLE = {f"{layout}-{name}": (layout, c) for layout, name, c in holdable() if layout != "torchtransient"}
