@@ -14,7 +14,7 @@ help:
 	@echo "make test       default tests          make test-slow  the long ones"
 	@echo "make test-portable  sensors, losses and reconstruction with the arithmetic of an older processor"
 	@echo "make test-browser  pages in Chromium (Debian: apt-get install -y chromium)"
-	@echo "make soak       sweeps: ten thousand mutated files for each reader, a thousand kills (up to 3 h)"
+	@echo "make soak       sweeps (ten thousand mutated files for each reader, a thousand kills), longest cases (up to 4 h)"
 	@echo "make lint       ruff and mypy          make doctor     check the machine"
 	@echo "make test-lowest  smoke tests with the lowest versions that are allowed, in an environment of its own (6 GB)"
 	@echo "make release-check  wheel and sdist, in dist/, and the wheel in an empty environment"
