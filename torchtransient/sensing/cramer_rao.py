@@ -95,7 +95,8 @@ def crlb(
     differentiable in all tensors and in the parameters of the response, so that a device can be designed by them.
     Without background, in bins that are narrow beside a normal pulse, ``distance_m`` is `range_deviation_m`. Memory:
     some ten numbers of 8 bytes for each pixel and bin. Not supported: dead times with several detections a cycle,
-    free-running detectors, readout noise: `covariance_bound` where their statistics are one of the two.
+    free-running detectors, readout noise: `covariance_bound` where their statistics are one of the two. All three
+    numbers are unknown; where the background is known, `covariance_bound` by the other two.
 
     Args:
         response: impulse response.
