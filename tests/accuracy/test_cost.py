@@ -226,6 +226,7 @@ def test_complex_quantities_and_samplers_alone():
     assert all(np.isnan(p.total_error) for p in alone.points) and alone.settings["finest"] == {}
 
 
+@pytest.mark.slow
 def test_gradients_are_compared_with_the_finest_that_has_some():
     report = tt.cost_of_accuracy(
         wall_renderer(), spp=(16,), gradients=[WALL], samplers=("independent",), temporal_filters=("box", "tent"),

@@ -142,7 +142,7 @@ def candidate(bias=0.0, salt=0):
     return {"values": Task(run)}
 
 
-@pytest.mark.parametrize("reference_spp", [None, 4096])
+@pytest.mark.parametrize("reference_spp", [None, pytest.param(4096, marks=pytest.mark.slow)])
 def test_bands_hold_the_error(reference_spp):
     """Of the noise, and of noise and bias: 95 of 100, within what 200 reports can tell."""
     held = np.zeros(3)

@@ -77,7 +77,8 @@ def test_mean_rate_of_a_hidden_plate(kind):
 
 
 @pytest.mark.parametrize(
-    "key, step", [("hidden.velocity.angular", 1e-2), ("hidden.to_world", 4e-3)]
+    ("key", "step"),
+    [pytest.param("hidden.velocity.angular", 1e-2, marks=pytest.mark.slow), ("hidden.to_world", 4e-3)],
 )
 def test_derivatives_behind_an_occluder(key, step):
     """Both modes against differences with the same samples, with the outline of the occluder in the pose's."""

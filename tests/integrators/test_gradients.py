@@ -29,7 +29,7 @@ LONG = {
     "phasor_glass_index", "meter_moves", "instance_of_a_grid_turns", "pattern_and_light_move", "gap_lamp_with_a_cone",
     "gap_polarized", "gap_lamp_with_stripes_moves", "gap_lamp_tilts", "instance_and_its_mirror_turn",
     "phase_of_weight_1", "normals_in_an_instance", "polarized_fluorescent_yield",
-    "area_light_over_a_delayed_wall_moves",
+    "area_light_over_a_delayed_wall_moves", "bare_light_grows",
 }  # fmt: skip
 # Nor the first cases of rows whose code a quicker case of another row runs, too: surfaces, media, lights, sensors,
 # instances, indices and textures are in the default set once or twice each, polarization in test_singular_mueller.py.

@@ -152,6 +152,7 @@ def test_it_is_the_light_of_plain_paths(name):
     check_same_light(SCENES[name]())
 
 
+@pytest.mark.slow
 def test_wavelengths():
     check_same_light(room(), "llvm_ad_spectral")
 

@@ -119,6 +119,7 @@ def test_velocities_colours_places_and_poses_in_a_room(variant):
     compare(renderer, together=[f"{name}.velocity" for name in MOTIONS])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", in_variants(VARIANT))
 def test_beats_of_a_room(variant):
     keys = ["back.velocity.linear", "side.velocity.angular", "sensor.velocity.linear", "lamp.position"]
@@ -213,6 +214,7 @@ def test_velocities_and_index_of_glass():
     compare(renderer_of(loaded, keys, spp=1 << 15), seeds=range(8))
 
 
+@pytest.mark.slow
 def test_velocities_of_vertices():
     vertices = np.array([[-9, -9, 3.0], [9, -9, 3.2], [9, 9, 3.1], [-9, 9, 2.9]])
     speeds = np.array([[0.3, -0.4, 1.2], [0.5, 1.0, -0.7], [0.2, 0.1, 2.0], [-1.0, 0.3, 0.4]])
@@ -242,6 +244,7 @@ def test_places_and_shadows_of_lamps_whose_vertices_move():
     compare(renderer_of(bent_lamp(plate=hider), ["plate.to_world"]), {"plate.to_world": SIDEWAYS}, seeds=range(6))
 
 
+@pytest.mark.slow
 def test_wind_on_a_grid():
     """Its numbers, beside the velocity and the colour of the wall behind."""
     data = np.random.default_rng(3).normal(size=(2, 3, 3, 3)).astype(np.float32)

@@ -75,6 +75,7 @@ def test_phasors(folder):
     assert bool((found["renderer"].values["red.reflectance.value"].grad != 0).all())
 
 
+@pytest.mark.slow
 def test_motion(folder):
     found = Page("docs/motion.md").names(SMALL | {r"spp=\d+": "spp=64"})
     assert found["out"].phasor.shape == (3, 1, 6, 6) and found["velocity"].grad.norm() > 0

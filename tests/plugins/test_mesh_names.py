@@ -123,13 +123,8 @@ def derivatives(key, face_normals):
     return table, out.transient.detach(), grad
 
 
-@pytest.mark.parametrize(
-    ("key", "face_normals"),
-    [
-        pytest.param("cube.vertex_positions", False, marks=pytest.mark.slow),
-        ("cube.to_world", True),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("key", "face_normals"), [("cube.vertex_positions", False), ("cube.to_world", True)])
 def test_renders_and_gradients_are_the_same(request, key, face_normals):
     table, image, grad = derivatives(key, face_normals)
     request.getfixturevalue("new_meshes")

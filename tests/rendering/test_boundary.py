@@ -77,7 +77,7 @@ def test_both_modes_agree():
     assert float(tangent) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("boundary", [True, False])
+@pytest.mark.parametrize("boundary", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_what_moves_as_one_has_no_derivative(boundary):
     """Scene, light and camera shifted together: zero at each seed, not on average alone."""
     facing_down = pose(0.5, 0.3, 3, 0.2) @ np.diag([1.0, -1, -1, 1])
@@ -95,6 +95,7 @@ def test_what_moves_as_one_has_no_derivative(boundary):
         assert (shifts.sum(0).abs() < 1e-4 * shifts.abs().sum(0)).all()
 
 
+@pytest.mark.slow
 def test_every_entry_of_a_batch_has_the_term():
     renderer = tt.TransientRenderer(plate(), [BODY, PAINT], spp=16)
     alone, base = reverse(renderer), renderer.values[BODY].detach()

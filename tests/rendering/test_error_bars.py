@@ -125,6 +125,7 @@ def test_other_films(settings):
     assert 0.3 < float(found) < 1.9
 
 
+@pytest.mark.slow
 def test_pixels_that_share_light():
     """Confocal points of the wall share what is sampled of the hidden scene: the whole functional is squared, and noise
     of pixels is not their share of the noise of a cell. 40 runs against 8 batches each.
@@ -156,7 +157,8 @@ FILMS_OF_ROWS = {
 }
 
 
-@pytest.mark.parametrize(("name", "errors"), [("rates", True), pytest.param("beats", "bins", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "errors"), [("rates", True), ("beats", "bins")])
 def test_histograms_of_several_rows(name, errors):
     """Rows of a pixel see the same paths: the error of a sum over them is that of the sum."""
     scene = room("llvm_ad_mono").moving({"small-box": tt.Motion(linear=(0.0, 0.0, 2.0), angular=(0.0, 3.0, 0.0))})

@@ -173,6 +173,7 @@ def test_batches_and_sensors(two_views):
     assert set(got.stats.derivatives_recorded) == {"launched"}
 
 
+@pytest.mark.slow
 def test_forward_mode(room_scene):
     traced, recorded = pair(room_scene, parameters=[COLOUR, WALL_POSE], spp=4)
     tangent = torch.zeros(4, 4)

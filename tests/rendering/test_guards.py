@@ -101,7 +101,8 @@ def step(renderer, kind):
 
 
 @pytest.mark.parametrize(("kind", "place"), [
-    ("render", "prepared"), ("backward", "start"), ("render", "run"), ("backward", "run"), ("forward", "run"),
+    ("render", "prepared"), ("backward", "start"), ("render", "run"), ("backward", "run"),
+    pytest.param("forward", "run", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_an_interrupted_call_leaves_nothing_behind(kind, place, monkeypatch):
     """Variant, lock and collector are as before, and so are the next call and the described values."""

@@ -112,13 +112,12 @@ def test_reverse_mode_against_finite_differences(scene, weights):
 
 def test_losses_of_complex_numbers(scene):
     """Torch's own rules meet ours at the complex output: reverse mode equals forward mode."""
-    renderer = renderer_of(scene, WALL_POSE)
-    value = renderer.values[WALL_POSE].detach()
-    tangent = torch.zeros(4, 4)
-    tangent[2, 3] = 1.0
+    renderer = renderer_of(scene, COLOUR)
+    value = renderer.values[COLOUR].detach()
+    tangent = torch.tensor([1.0, -0.5, 0.3])
 
     def function(x):
-        out = renderer({WALL_POSE: x}, seed=4)
+        out = renderer({COLOUR: x}, seed=4)
         return torch.sin(out.phasor[:, 0].angle()).sum() + out.phasor.imag.square().sum() + 0.3 * out.steady.sum()
 
     x = value.clone().requires_grad_()

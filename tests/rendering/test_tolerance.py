@@ -216,6 +216,7 @@ def test_going_on_for_other_bins(renderer, result):
     assert to_tolerance(renderer, seed=3, resume=of_loss).error == pytest.approx(result.error, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_errors_are_calibrated(scene):
     """Against a long reference squared deviations are what they are said to be, and 90 % of the bins keep to rtol."""
     renderer = tt.TransientRenderer(scene, physics="ignore")

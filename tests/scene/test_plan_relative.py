@@ -69,7 +69,7 @@ def test_light_is_shared_up_to_the_depth_of_the_plan():
     assert any("path reuse: not used" in line and "no limit" in line for line in unlimited.reasons)
 
 
-@pytest.mark.parametrize(("width", "error"), [(0.06, "squared"), (6.0, "relative")])
+@pytest.mark.parametrize(("width", "error"), [(0.06, "squared"), pytest.param(6.0, "relative", marks=pytest.mark.slow)])
 def test_narrow_gates_are_connected_by_path_length(width, error):
     plan = tt.plan(box(), "gates", gates=tt.Gate.rectangular(7.5 - width / 2, 7.5 + width / 2), error=error)
     assert plan.connections == ("ellipsoidal" if width < 1 else None)

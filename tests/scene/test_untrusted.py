@@ -11,6 +11,7 @@ import pytest
 
 import torchtransient as tt
 from support import deadly_plugins
+from support.marks import long
 from tools.small_room import VARIANT, make_room
 from torchtransient import plugins
 from torchtransient.errors import SceneError
@@ -103,7 +104,7 @@ def test_what_is_right_is_loaded_and_what_is_wrong_is_said():
 # ------------------------------------------------------------------------------------------------- long before kernels
 
 
-@pytest.mark.parametrize("kind", ["blendphase", "shapegroup"])
+@pytest.mark.parametrize("kind", long(["blendphase", "shapegroup"], ["shapegroup"]))
 def test_thousands_of_references_are_counted_at_once(kind):
     room = make_room()
     for n in range(3000):

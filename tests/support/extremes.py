@@ -22,7 +22,7 @@ NOISE = 5 / math.sqrt(SAMPLES)  # five standard errors of the mean of numbers wi
 for_all_runs = pytest.mark.parametrize(
     ("variant", "sampler", "examples"),
     [
-        ("llvm_ad_mono", "owen", 12),
+        ("llvm_ad_mono", "owen", 8),
         pytest.param("llvm_ad_rgb", "independent", 20, marks=pytest.mark.slow),
     ],
 )
