@@ -27,6 +27,7 @@ def capture_of(hidden, key, change, kind="single", points=3, bounces=4, **integr
     return MovedCapture(scan_scene(hidden, kind, film(points, kind=kind, **SMOOTH), **settings), key, change)
 
 
+@pytest.mark.slow
 def test_late_light_that_a_plate_hides():
     """The derivative is that of long finite differences; paths alone have the other sign, .00021."""
     capture = capture_of(plates(), "front.to_world", move(1, 0, 0), points=2)

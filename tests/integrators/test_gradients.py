@@ -29,7 +29,7 @@ LONG = {
     "phasor_glass_index", "meter_moves", "instance_of_a_grid_turns", "pattern_and_light_move", "gap_lamp_with_a_cone",
     "gap_polarized", "gap_lamp_with_stripes_moves", "gap_lamp_tilts", "instance_and_its_mirror_turn",
     "phase_of_weight_1", "normals_in_an_instance", "polarized_fluorescent_yield",
-    "area_light_over_a_delayed_wall_moves", "bare_light_grows",
+    "area_light_over_a_delayed_wall_moves",
 }  # fmt: skip
 # Nor the first cases of rows whose code a quicker case of another row runs, too: surfaces, media, lights, sensors,
 # instances, indices and textures are in the default set once or twice each, polarization in test_singular_mueller.py.
@@ -43,7 +43,7 @@ ALIKE = {
     "conductor_eta", "side_moves", "medium_sigma_t", "index_of_masked_thin_glass", "banded_albedo_spectrum", "lifetime",
     "gated_wall", "ellipsoid_changes", "instance_turns", "mirror_normals",
     "gap_plates", "sky_texture", "wall_under_long_pulse", "medium_flakes_in_clouds", "mirror_normals_in_an_attribute",
-    "mirror_tilts",
+    "mirror_tilts", "bare_light_grows",
 }  # fmt: skip
 
 

@@ -184,6 +184,7 @@ def test_window_and_light_outside_make_up_the_steady_image():
     assert total.item() == pytest.approx(out.steady.double().sum().item() / 3, rel=2e-6)
 
 
+@pytest.mark.slow
 def test_late_light_has_less_noise():
     with torch.no_grad():
         found = {

@@ -87,6 +87,7 @@ def test_motion(folder):
     assert found["range_m"].shape == found["approach_m_s"].shape == (3, 6, 6)
 
 
+@pytest.mark.slow
 def test_pictures(folder):
     Page("docs/pictures.md").names({**SMALL, "num_bins=400": "num_bins=10, bin_width_opl=0.8", "every=5": "every=2"})
     assert (folder / "light.mp4").stat().st_size > 500

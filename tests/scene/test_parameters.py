@@ -112,7 +112,7 @@ TOGETHER = [
     ("wall.bsdf.reflectance.data", "box.to_world", "ball.to_world", "spot.to_world", "lamp.emitter.radiance.value"),
     ("wall.to_world", "lamp.to_world", "light.position", "box.vertex_normals", "box.bsdf.alpha.value"),
     ("sensor.to_world", "sensor.x_fov"),
-    ("wall.bsdf.reflectance.data", "box.to_world"),
+    ("wall.bsdf.reflectance.data", "lamp.emitter.radiance.value"),
 ]
 
 

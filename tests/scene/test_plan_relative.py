@@ -38,6 +38,7 @@ def test_paths_stay_plain(reason):
     assert plan.rr_depth > plan.max_depth
 
 
+@pytest.mark.slow
 def test_depths_of_late_light_are_said_with_what_they_rest_on():
     """A gate that some twenty arrivals meet: none lies deeper, and of the gate's light a part does all the same."""
     scene, gate = box(max_depth=-1), tt.Gate.rectangular(15.0, 15.06)
@@ -58,6 +59,7 @@ def test_roulette_stays_where_nothing_else_ends_paths():
     assert plan.rr_depth is None
 
 
+@pytest.mark.slow
 def test_light_is_shared_up_to_the_depth_of_the_plan():
     """Of a scene without a limit, too; one that is asked for leaves paths plain, and the plan says so."""
     scene = box(max_depth=-1)

@@ -72,6 +72,7 @@ def check_modes(name, *passes):
     assert forward == pytest.approx(reverse, rel=ROUNDING)
 
 
+@pytest.mark.slow
 def test_forward_mode():
     check_modes("contact4", "primary", "vertex", "light")
 
