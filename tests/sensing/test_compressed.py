@@ -15,8 +15,9 @@ def test_binary_frames_and_their_inverse():
     rate = torch.tensor([0.0, 0.1, 1.0, 3.0], dtype=torch.float64).view(1, 4, 1, 1)
     sensor = sensing.BinaryFrames(1000)
     torch.testing.assert_close(sensing.frames_to_rate(sensor(rate), 1000), rate, atol=1e-12, rtol=1e-9)
-    full = sensing.frames_to_rate(torch.tensor(1000.0, dtype=torch.float64), 1000)
-    assert float(full) == pytest.approx(math.log(2000), rel=1e-12)  # of a share 1 - 1/2000
+    for frames in (1000, 3 * 10**7):  # all of them fired: the rate of a share 1 - 1/(2 frames)
+        full = sensing.frames_to_rate(torch.tensor(float(frames)), frames)
+        assert float(full) == pytest.approx(math.log(2 * frames), rel=1e-6)
     h = sensor.sample(rate.expand(1, 4, 100, 100), torch.Generator().manual_seed(0))
     p = -torch.expm1(-rate)
     z = (h.mean((-1, -2)) - 1000 * p.mean((-1, -2))) / (1000 * p * (1 - p) / 1e4).sqrt().clamp_min(1e-9).squeeze()
