@@ -160,12 +160,14 @@ def test_parameters_that_are_kept_may_be_used_on_the_way():
         Doubled(gain, keep=False)
 
     class Summed(sensing.Sensor):
-        def __init__(self, *gains):
+        def __init__(self, *gains, offset=0.0):
             super().__init__()
-            self.first = gains[0]
+            self.first, self.offset = gains[0], offset
 
     with pytest.raises(GradientError, match="Summed: expected argument 1"):
         Summed(gain, gain.square())
+    with pytest.raises(GradientError, match="Summed: expected argument 1"):
+        Summed(gain, gain.square(), offset=1.0)
 
 
 @pytest.mark.parametrize("name", ["phase_offset_rad", "phase_map_rad", "depth_map_m"])

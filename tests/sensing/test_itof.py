@@ -89,6 +89,17 @@ def test_binary_code_against_a_sampled_correlation():
     np.testing.assert_allclose(code.evaluate(x).numpy(), 2 * overlap - 1, atol=1e-9)
 
 
+@pytest.mark.parametrize("light_duty, gate_duty", [(0.2, 0.5), (0.4, 0.25)])
+def test_rectangles_of_unequal_duties_overlap_in_a_trapezoid(light_duty, gate_duty):
+    """Its middle is the phase of the tap, zero of tap 0: the overlap falls as the middles of light and gate part."""
+    code = sensing.square_code(3, light_duty, gate_duty)
+    x = torch.linspace(0, 1, 301, dtype=torch.float64)
+    for n, weight in enumerate(code.evaluate(x)):
+        apart = (torch.remainder(x - n / 3 + 0.5, 1) - 0.5).abs()
+        overlap = ((light_duty + gate_duty) / 2 - apart).clamp(0, min(light_duty, gate_duty)) / light_duty
+        torch.testing.assert_close(weight, 2 * overlap - 1, rtol=0, atol=1e-11)  # corners are rounded to 1e-12
+
+
 @pytest.mark.parametrize("num_taps", WIGGLE)
 def test_wiggling(num_taps):
     """Square on square aliases the harmonics m N +- 1 into the phase: the table of peak errors, to 1e-4 rad."""

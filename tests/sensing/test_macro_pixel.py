@@ -218,6 +218,16 @@ def test_no_spad_coincides_with_itself(mode, dead):
     assert drawn == pytest.approx(float(both.expected(bright).sum()), rel=0.03)
 
 
+@pytest.mark.parametrize("mode", ["first", "free"])
+def test_a_dark_pixel_sees_no_coincidence_and_leaves_those_beside_it(mode):
+    """Draws of pixels on both of its sides keep their means, bin by bin; binomials vary less than these."""
+    x = torch.cat([image(rate) for rate in (light(10.0), np.zeros(BINS), light(10.0, "edges"))], -1)
+    sensor = CoincidencePixel(detector(mode, 9.5, 5000), 4, coincidence=2, window_s=3.4 * WIDTH, bin_width_s=WIDTH)
+    drawn, mean = sensor.sample(x, torch.Generator().manual_seed(0)), sensor.expected(x)
+    assert not drawn[..., 1].any() and not mean[..., 1].any()
+    assert bool(((drawn - mean).abs() <= 5 * mean.sqrt()).all()) and float(mean[..., 0].max()) > 100
+
+
 @pytest.mark.parametrize(("mode", "dead"), long_rows([("first", 9.5), ("free", 9.3)], [("first", 9.5)]))
 def test_scores_of_coincidences(mode, dead):
     """d/da of the mean total, and of its mean square by a difference quotient of draws, at a times the light."""

@@ -143,12 +143,21 @@ def test_armed_cycles_are_counted_without_gradient(dead_bins):
 # ------------------------------------------------------------------------------------- derivatives that are to stay
 
 
-def test_the_normal_surrogate_of_a_free_running_detector():
-    """Its derivative is that of the mean, and of the size of what is beside it as of independent bins."""
-    spad = sensing.FreeRunningSPAD(400, 150 * PS, axis=AXIS, grad="gaussian")
+SURROGATES = {
+    "running free": lambda: sensing.FreeRunningSPAD(400, 150 * PS, axis=AXIS, grad="gaussian"),
+    "coincidences": lambda: sensing.CoincidencePixel(
+        sensing.SynchronousSPAD(400), 3, coincidence=2, window_s=150 * PS, axis=AXIS, grad="gaussian"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SURROGATES)
+def test_normal_surrogates_of_events(name):
+    """Their derivative is that of the mean, and of the size of what is beside it as of independent bins."""
+    sensor = SURROGATES[name]()
     x = light()
-    y, mean = spad(x, generator=generator()), spad.expected(x)
-    size = (spad.variance(x) + 1e-4).log() / 2
+    y, mean = sensor(x, generator=generator()), sensor.expected(x)
+    size = (sensor.variance(x) + 1e-4).log() / 2
     wanted = torch.autograd.grad((mean + (y - mean).detach() * size).sum(), x)[0]
     torch.testing.assert_close(torch.autograd.grad(y.sum(), x)[0], wanted)
 

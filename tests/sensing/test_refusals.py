@@ -161,7 +161,7 @@ UNITS = [
     lambda: budget(repetition_rate_hz=10.0, cycles=100_000),
     lambda: budget(cycles=None, exposure_s=1e-9),
     lambda: budget(repetition_rate_hz=2e9)(LIGHT),
-    lambda: sensing.frames_to_rate(torch.tensor([10.0, 400.0]), 255),
+    lambda: sensing.frames_to_rate(torch.tensor([4.0, 32.0]), 16),
     lambda: sensing.SpatialPSF(torch.tensor([[3.0, -1.0, 1.0]])),
     lambda: sensing.SweepJitter(1.5e-9, AXIS)(LIGHT),
     lambda: sensing.PixelElectronics(gain_e_per_dn=2.0),

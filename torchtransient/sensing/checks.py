@@ -107,7 +107,7 @@ def careful_init(init: Callable[..., None]) -> Callable[..., None]:
         init(self, *given, **named)
         # once, when the whole object is there; private parts are looked at with what they are part of
         if getattr(type(self).__init__, "__wrapped__", None) is init and not where.startswith("_"):
-            names = init.__code__.co_varnames[1:]
+            names = init.__code__.co_varnames[1 : init.__code__.co_argcount]
             places = {names[i] if i < len(names) else f"argument {i}": value for i, value in enumerate(given)}
             check_kept(self, {**places, **named}, where)
 

@@ -460,7 +460,8 @@ def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
             f"frames_to_rate: expected at most as many counts as the {number} frames, got {float(counts.max()):g}. "
             "Give the frames of the sensor that counted: BinaryFrames.frames."
         )
-    return -torch.log1p(-(counts / number).clamp(0, 1 - 1 / (2 * number)))
+    # in double: 1 - 1/(2 frames) is 1 in single precision from 2^24 frames on
+    return -torch.log1p(-(counts.double() / number).clamp(0, 1 - 1 / (2 * number))).to(counts.dtype)
 
 
 class BinaryFrames(RandomSensor):
