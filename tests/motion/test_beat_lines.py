@@ -161,6 +161,27 @@ def test_lines_begin_and_end_without_a_jump(window, width):
     np.testing.assert_allclose(found[1:], wanted, rtol=0, atol=16 * 2**-24 * found.max())
 
 
+def test_slopes_are_put_as_they_are_read():
+    """Derivatives of both modes are those of one film: by the light, by the length and by the rate of arrivals."""
+    mi.set_variant("llvm_ad_rgb")
+    film, rng = splined_film(), np.random.default_rng(6)
+    opl, rate, light = rng.uniform(-3, 22, 300), rng.uniform(-5, 5, 300), rng.normal(size=(3, 3, 300))
+    nodes = storage(film, math.prod(film.storage_shape()))
+    # six numbers for each of 64 bins: both chirps, three channels
+    g = mi.Float(rng.normal(size=2 * 64 * 3))
+    adjoint, offset, strides = film.stored_adjoint((g, 0, (384, 384, 192, 3, 1)))
+    where = mi.UInt32(0), mi.Float64(opl)
+    by_light, by_opl, by_rate = ([mi.Float(channel) for channel in part] for part in light)
+    film.put_slope(0, *where, by_light, by_opl, mi.Bool(True), mi.Float(rate), by_rate)
+    read = film.read((adjoint, *strides[2:]), *where, mi.Bool(True), rate=mi.Float(rate))
+    dr.eval(nodes, read)
+    terms = np.array([[np.array(channel, dtype=float) for channel in part] for part in read]) * light
+    assert offset == 0 and min(np.abs(terms).max((1, 2))) > 0.1
+    found = np.vdot(np.array(nodes, dtype=float), np.array(adjoint, dtype=float))
+    # sums of 300 arrivals in single precision
+    assert found == pytest.approx(terms.sum(), abs=1e-6 * np.abs(terms).sum())
+
+
 def test_lengths_that_are_no_numbers_are_nowhere():
     """An arrival that overflows adds to no node, before the window, in it or behind it."""
     mi.set_variant("llvm_ad_rgb")
