@@ -357,18 +357,20 @@ def test_numbers_that_make_a_plausible_loss_are_an_error(case):
 
 @every
 def test_an_option_with_a_gradient_has_it_or_is_refused(case):
-    """Never a number in silence, whose derivative is nothing."""
+    """Never a number in silence, whose derivative is nothing. A dead pixel, which a mask leaves out, has no part."""
     x, y = case.tensors()
+    mask, spoiled = mask_of(y), y.clone()
+    mask[..., 2, 3], spoiled[..., 2, 3] = False, float("nan")
     for option in number_options(case.module):
-        number = FITS.get(option, case.options.get(option))
+        number = FITS.get((case.name, option), FITS.get(option, case.options.get(option)))
         if (case.name, option) in IDLE:
             continue
         assert number is not None, f"{case}: give its case a {option}, or FITS in tests/support/loss_cases.py"
         leaf = torch.tensor(number, dtype=torch.float64, requires_grad=True)
 
-        def value(given, option=option):
+        def value(given, target=y, mask=None, option=option):
             given = given if given.ndim == 0 else tuple(given)
-            return dataclasses.replace(case, options={**case.options, option: given})(x, y, reduction="sum")
+            return dataclasses.replace(case, options={**case.options, option: given})(x, target, mask, reduction="sum")
 
         refused = ""
         try:
@@ -378,8 +380,9 @@ def test_an_option_with_a_gradient_has_it_or_is_refused(case):
         if refused:
             assert "without a gradient" in refused
             value(leaf.detach())
-        else:
-            assert torch.autograd.gradcheck(value, leaf, fast_mode=True), option
+            continue
+        assert torch.autograd.gradcheck(value, leaf, fast_mode=True), option
+        assert torch.autograd.gradcheck(lambda v, seen=value: seen(v, spoiled, mask), leaf, fast_mode=True), option
 
 
 def test_options_with_a_tangent_of_forward_mode():

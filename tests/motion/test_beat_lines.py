@@ -128,14 +128,66 @@ def test_batches_of_a_crop():
             torch.testing.assert_close(beats, renderer({key: albedo}, seed=3).beats, rtol=1e-4, atol=1e-7)
 
 
+def splined_film(**more):
+    film = mi.load_dict({
+        "type": "beat_hdr_film", "width": 1, "height": 1, "temporal_bins": 64, "start_opl": 0.0, "bin_width_opl": 0.3,
+        "chirp_bandwidth": 1e9, "chirp_duration": 1e-6, "chirp_wavelength": 1550e-9, **more,
+    })  # fmt: skip
+    assert film.splined
+    return film
+
+
+@pytest.mark.parametrize(("window", "width"), [("hann", 0.075), ("blackmanharris", 0.6)])
+def test_lines_begin_and_end_without_a_jump(window, width):
+    """What a bin receives of an arrival is the integral of its slope by the length, from one end of the line to the
+    other: what came or went in a jump would be missing in gradients.
+    """
+    mi.set_variant("llvm_ad_mono")
+    film = splined_film(chirp_window=window, temporal_filter="tent", bin_width_opl=width, temporal_bins=1)
+    # of the bin of the up chirp alone
+    adjoint, offset, strides = film.stored_adjoint((mi.Float([1.0, 0.0]), 0, (2, 2, 1, 1, 1)))
+
+    def read(opl):
+        base, rate = mi.UInt32(offset), mi.Float(0)
+        A, slope, _ = film.read((adjoint, *strides[2:]), base, mi.Float64(opl), mi.Bool(True), rate=rate)
+        dr.eval(A, slope)
+        return np.array(A[0], dtype=float), np.array(slope[0], dtype=float)
+
+    # nodes are two steps apart, and between them slopes are straight: the middle rule is exact
+    step = width / (2 * film.filter.parts)
+    places = np.arange(-60 * film.filter.parts, 60 * film.filter.parts) * step
+    (found, _), (_, slope) = read(places), read(places + step / 2)
+    assert found[0] == found[-1] == 0 < found.max()
+    # single precision: three products to a value, and slopes whose moduli sum up to twice the largest value
+    wanted = np.cumsum(slope[:-1] * step)
+    np.testing.assert_allclose(found[1:], wanted, rtol=0, atol=16 * 2**-24 * found.max())
+
+
+def test_slopes_are_put_as_they_are_read():
+    """Derivatives of both modes are those of one film: by the light, by the length and by the rate of arrivals."""
+    mi.set_variant("llvm_ad_rgb")
+    film, rng = splined_film(), np.random.default_rng(6)
+    opl, rate, light = rng.uniform(-3, 22, 300), rng.uniform(-5, 5, 300), rng.normal(size=(3, 3, 300))
+    nodes = storage(film, math.prod(film.storage_shape()))
+    # six numbers for each of 64 bins: both chirps, three channels
+    g = mi.Float(rng.normal(size=2 * 64 * 3))
+    adjoint, offset, strides = film.stored_adjoint((g, 0, (384, 384, 192, 3, 1)))
+    where = mi.UInt32(0), mi.Float64(opl)
+    by_light, by_opl, by_rate = ([mi.Float(channel) for channel in part] for part in light)
+    film.put_slope(0, *where, by_light, by_opl, mi.Bool(True), mi.Float(rate), by_rate)
+    read = film.read((adjoint, *strides[2:]), *where, mi.Bool(True), rate=mi.Float(rate))
+    dr.eval(nodes, read)
+    terms = np.array([[np.array(channel, dtype=float) for channel in part] for part in read]) * light
+    assert offset == 0 and min(np.abs(terms).max((1, 2))) > 0.1
+    found = np.vdot(np.array(nodes, dtype=float), np.array(adjoint, dtype=float))
+    # sums of 300 arrivals in single precision
+    assert found == pytest.approx(terms.sum(), abs=1e-6 * np.abs(terms).sum())
+
+
 def test_lengths_that_are_no_numbers_are_nowhere():
     """An arrival that overflows adds to no node, before the window, in it or behind it."""
     mi.set_variant("llvm_ad_rgb")
-    film = mi.load_dict({
-        "type": "beat_hdr_film", "width": 1, "height": 1, "temporal_bins": 64, "start_opl": 0.0, "bin_width_opl": 0.3,
-        "chirp_bandwidth": 1e9, "chirp_duration": 1e-6, "chirp_wavelength": 1550e-9,
-    })  # fmt: skip
-    assert film.splined
+    film = splined_film()
     nodes = storage(film, math.prod(film.storage_shape()))
     opl = mi.Float64([math.nan, math.inf, 1e300, -1e300])
     film.put(0, mi.UInt32(0), opl, [mi.Float(1)] * 3, mi.Bool(True), rate=mi.Float(0))
