@@ -111,3 +111,15 @@ def test_other_processes_have_them(theirs, tmp_path):
     with pytest.raises(StorageError, match="versions is"):
         generate(recipe, tmp_path / "set", **QUICK)
     assert verify(tmp_path / "set").missing == (2, 3)
+
+
+@pytest.mark.slow
+def test_a_module_that_other_processes_do_not_find(theirs, tmp_path):
+    """Its name is in the error, which is that of a recipe made there."""
+    recipe = painted(plugins=[theirs.stem])
+    theirs.unlink()
+    wanted = "no module named 'their_paint_module'"
+    with pytest.raises(PluginRegistrationError, match=wanted):
+        generate(recipe, tmp_path / "set", **QUICK)
+    with OnlineDataset(recipe, capacity=4, warm=1) as data, pytest.raises(PluginRegistrationError, match=wanted):
+        data.draw()

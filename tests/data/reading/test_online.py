@@ -116,6 +116,18 @@ def test_uses_of_a_full_ring_are_what_was_asked_for():
     assert schedule.drawn / schedule.made > 4.7
 
 
+@pytest.mark.parametrize(("capacity", "producers", "each"), [(64, 2, 8), (4096, 2, 64), (4, 3, 1)])
+def test_a_quarter_of_a_full_ring_is_rendered_and_the_rest_is_drawn(capacity, producers, each):
+    """Producers share it: one sample each at least, 64 at most."""
+    schedule = Schedule(capacity, producers, uses=math.inf, warm=1, first=0, seed=0)
+    for _ in range(capacity):
+        schedule.finished(schedule.order(0).index)
+    ordered = [order.slot for n in range(producers) for order in iter(lambda n=n: schedule.order(n), None)]
+    assert len(ordered) == producers * each
+    # The probability that 20 draws a place leave one out is below 1e-5.
+    assert {schedule.draw() for _ in range(20 * capacity)} == set(range(capacity)) - set(ordered)
+
+
 # -------------------------------------------------------------------------------------------------- whole data sets
 
 

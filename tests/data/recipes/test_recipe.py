@@ -173,6 +173,16 @@ def test_light_outside_of_the_window():
     assert sample.outside[1] == pytest.approx(whole[40:].sum() / whole.sum(), rel=1e-2)
 
 
+def test_light_outside_is_measured_with_65536_camera_paths_at_most():
+    """1024 for each of 4 by 16 pixels, however many more the recipe has."""
+
+    def found(spp):
+        recipe = small(tt.scenes.cornell_box((4, 16)), {}, time_axis=tt.TimeAxis(6.0, 0.2, 10), spp=spp)
+        return recipe.maker().kept(recipe.structure(0)).outside(0)
+
+    assert found(4096) == found(1024) != found(512)
+
+
 def test_samples_whose_light_the_window_misses(monkeypatch):
     """They are counted before the run as they come in it; no sample is left out for it."""
     recipe = small(time_axis=tt.TimeAxis(2.0, 0.2, 45), vary={"white.reflectance.value": D.Uniform(0.1, 0.95)})

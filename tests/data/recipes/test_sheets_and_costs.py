@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -139,6 +141,16 @@ def test_seconds_of_a_sample():
     assert cost(seen=1).sample_s == 0.375
     three = (*cost().structures, StructureCost("", 2.0, 0.75))
     assert cost(seen=32, structures=three).sample_s == pytest.approx(0.5 * 1.5 + 0.5 * 0.5)
+
+
+@pytest.mark.parametrize("n", [1, 10, 100, 270, 1000, 7200, 10**6])
+def test_time_and_bytes_of_a_data_set_are_those_of_its_samples(n):
+    """In plain numbers of two figures and three; bytes from the smallest store to what is not compressed."""
+    units = {"seconds": 1, "minutes": 60, "hours": 3600, "B": 1, "kB": 1e3, "MB": 1e6, "GB": 1e9}
+    said = re.findall(rf"([\d.]+) ({'|'.join(units)})\b", str(cost(n=n)).splitlines()[-1])
+    seconds, least, most = (float(number) * units[unit] for number, unit in said)
+    assert seconds == pytest.approx(n * cost().sample_s, rel=0.05)
+    assert (least, most) == pytest.approx((n * 500.0, n * 2000.0), rel=0.005)
 
 
 # ----------------------------------------------------------------------------------------------------------- of recipes
