@@ -1,4 +1,4 @@
-"""Draw docs/images/parametrize.png: the fit of docs/parametrize.md, with parametrizations and without.
+"""Draw the picture and print the table of docs/parametrize.md: its fit with parametrizations and without.
 
     python docs/make_parametrize_picture.py
 
@@ -7,6 +7,7 @@ The fit is the page's own first block; the free one is the same loop with Adam o
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,24 @@ def fits(names: dict[str, Any]) -> dict[str, list[list[dict[str, torch.Tensor]]]
     return found
 
 
+def row(names: dict[str, Any], run: list[dict[str, torch.Tensor]]) -> list[str]:
+    """Return the cells of a fit: its albedo and index, the lowest index on the way, and how far the wall is off."""
+    last, truth = run[-1], torch.as_tensor(names["TRUTH"]["pose"])
+    pose = last[names["POSE"]]
+    # Of its sides: the columns of a free matrix need not stay at right angles.
+    found, normal = (
+        torch.nn.functional.normalize(torch.linalg.cross(one[:3, 0].double(), one[:3, 1].double()), dim=0)
+        for one in (pose, truth)
+    )
+    distance = 1e3 * float((pose[:3, 3] - truth[:3, 3]).double() @ normal)
+    tilt = math.degrees(math.acos(min(1.0, float(found @ normal))))
+    rotation = pose[:3, :3].double() / 3  # the wall's scale
+    stretch = float((rotation.T @ rotation - torch.eye(3)).abs().max())
+    index = [float(one[names["INDEX"]]) for one in run]
+    numbers = (float(last[names["ALBEDO"]]), index[-1], min(index), abs(distance), tilt, stretch)
+    return [f"{value:.{digits}f}" for value, digits in zip(numbers, (3, 4, 2, 1, 2, 2), strict=True)]
+
+
 def main() -> None:
     tt.threads(1)
     names = page()
@@ -75,7 +94,8 @@ def main() -> None:
     path = HERE / "images" / "parametrize.png"
     save_figure(figure, path, "make_parametrize_picture")
     for kind, runs in found.items():
-        print(kind, [[round(number(run[-1]), 4) for _, number, _ in panels] for run in runs])
+        columns = zip(*(row(names, run) for run in runs), strict=True)
+        print(f"| {kind} | {' | '.join(', '.join(column) for column in columns)} |")
     print(path)
 
 
