@@ -22,7 +22,7 @@ from torchtransient.errors import ArgumentError, ShapeError
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
 # Readers of the library's own files, which stand in rooms above this one.
 _READERS = {
-    "torchtransient capture": ("torchtransient.files.capture_file", "read_capture"),
+    "torchtransient capture": ("torchtransient.files.captures.own", "read_capture"),
     "torchtransient volume": ("torchtransient.files.volume_file", "read_volume"),
     "": ("torchtransient.files.result_file", "read_result"),
 }

@@ -1,1 +1,1 @@
-"""Captures of other programs on disk, a file for each layout."""
+"""Captures of this and of other programs on disk, a file for each layout."""

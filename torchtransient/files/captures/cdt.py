@@ -11,7 +11,7 @@ import numpy as np
 
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import Contents
-from torchtransient.files.captures.gaps import Gaps, flat_scan, grid_points, numbers_in, tensor_of, time_axis
+from torchtransient.files.captures.reading import Reading, flat_scan, grid_points, numbers_in, tensor_of, time_axis
 
 NAME = "cdt"
 ENDINGS = (".mat",)
@@ -29,26 +29,26 @@ def recognises(contents: Contents) -> bool:
     return square or (slab is not None and len(slab) == 2 and slab[1] == 1)
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return a confocal capture on the plane z = 0 around the origin, hidden side +z; of ``out`` a capture of one
     point.
 
     Args:
         contents: the file.
-        gaps: arguments of the reader; ``wall_size=`` is needed.
+        reading: arguments of the reader; ``wall_size=`` is needed.
 
     Raises:
         StorageError: for wrong entries, and without ``wall_size=``.
     """
     name = "meas" if "meas" in contents.shapes else "out"
-    data = numbers_in(contents, name, gaps, 3 if name == "meas" else 2)
+    data = numbers_in(contents, name, reading, 3 if name == "meas" else 2)
     left = sorted(set(contents.shapes) - {name})
     if name == "out":
-        axis = time_axis(gaps, None, None, len(data), SLAB_BIN_WIDTH_S)
-        scan = flat_scan("confocal", np.zeros((1, 3)), gaps)
-        return Capture(tensor_of(data).reshape(1, -1, 1), axis, scan, metadata=gaps.metadata(not_read=left or None))
+        axis = time_axis(reading, None, None, len(data), SLAB_BIN_WIDTH_S)
+        scan = flat_scan("confocal", np.zeros((1, 3)), reading)
+        return Capture(tensor_of(data).reshape(1, -1, 1), axis, scan, metadata=reading.metadata(not_read=left or None))
     size = data.shape[1], data.shape[0]
-    scan = flat_scan("confocal", grid_points(size, gaps.extent(None)), gaps)
-    axis = time_axis(gaps, None, None, data.shape[2], BIN_WIDTH_S)
+    scan = flat_scan("confocal", grid_points(size, reading.extent(None)), reading)
+    axis = time_axis(reading, None, None, data.shape[2], BIN_WIDTH_S)
     tensor = tensor_of(data).permute(2, 1, 0)[None]
-    return Capture(tensor, axis, scan, metadata=gaps.metadata(not_read=left or None))
+    return Capture(tensor, axis, scan, metadata=reading.metadata(not_read=left or None))

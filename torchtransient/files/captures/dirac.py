@@ -15,16 +15,8 @@ from torchtransient.array_files.array_file import HDF5, array_of, replacing
 from torchtransient.array_files.hdf5 import new_hdf5, write_parts
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import WHAT, Contents
-from torchtransient.files.captures.gaps import (
-    Gaps,
-    cannot,
-    hidden_side,
-    numbers_in,
-    only_transient,
-    scan_of,
-    tensor_of,
-    time_axis,
-)
+from torchtransient.files.captures.reading import Reading, numbers_in, scan_of, tensor_of, time_axis
+from torchtransient.files.captures.writing import cannot, hidden_side, only_transient
 
 NAME = "dirac"
 ENDINGS = HDF5
@@ -44,20 +36,20 @@ def recognises(contents: Contents) -> bool:
     return set(contents.shapes) >= _REQUIRED
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return the confocal capture.
 
     Args:
         contents: the file.
-        gaps: arguments of the reader; if the legs count, ``sensor_origin=`` and ``laser_origin=`` are needed.
+        reading: arguments of the reader; if the legs count, ``sensor_origin=`` and ``laser_origin=`` are needed.
 
     Raises:
         StorageError: for wrong entries, uneven bins, and missing arguments.
     """
-    data, da = numbers_in(contents, "data_t", gaps, 3), numbers_in(contents, "da", gaps).reshape(-1)
-    x, y = numbers_in(contents, "xg", gaps, 2), numbers_in(contents, "yg", gaps, 2)
+    data, da = numbers_in(contents, "data_t", reading, 3), numbers_in(contents, "da", reading).reshape(-1)
+    x, y = numbers_in(contents, "xg", reading, 2), numbers_in(contents, "yg", reading, 2)
     if x.shape != data.shape[1:] or y.shape != data.shape[1:] or len(da) != len(data) or len(da) < 2:
-        raise gaps.error(
+        raise reading.error(
             f"expected data_t (T, X, Y), xg and yg (X, Y), da (T,) with T of 2 or more, got {data.shape}, {x.shape}, "
             f"{y.shape}, {da.shape}."
         )
@@ -67,18 +59,18 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         width = float(starts[-1] - starts[0]) / (len(da) - 1)
         even = np.all(np.abs(steps - width) <= _UNEVEN * abs(width))
     if not even:
-        raise gaps.error(f"expected equal steps in da, got {steps.min():.6g} to {steps.max():.6g} m.")
+        raise reading.error(f"expected equal steps in da, got {steps.min():.6g} to {steps.max():.6g} m.")
     points = np.stack(np.broadcast_arrays(x.T, y.T, 0.0), -1).astype(np.float64)
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    legs = not np.any(numbers_in(contents, "offset_laser", gaps))
+    legs = not np.any(numbers_in(contents, "offset_laser", reading))
     sensor_origin, laser_origin = (
-        gaps.origin(f"{who}_origin", None, points, normals, legs) for who in ("sensor", "laser")
+        reading.origin(f"{who}_origin", None, points, normals, legs) for who in ("sensor", "laser")
     )
     scan = scan_of("confocal", points, points, sensor_origin, laser_origin, normals, normals, legs=legs)
     kept = {name: array.tolist() for name in _KEPT if (array := contents.array(name)) is not None}
-    axis = time_axis(gaps, float(da[0]), width, len(da))
+    axis = time_axis(reading, float(da[0]), width, len(da))
     left = sorted(set(contents.shapes) - _KNOWN)
-    metadata = gaps.metadata(**kept, not_read=left or None)
+    metadata = reading.metadata(**kept, not_read=left or None)
     return Capture(tensor_of(data).transpose(1, 2)[None], axis, scan, metadata=metadata)
 
 

@@ -14,14 +14,24 @@ from torchtransient.capture import Capture
 from torchtransient.capture.capture import register_files
 from torchtransient.checks import shown, some_of
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.files import capture_file
-from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, tmf8828, vl53l8, zaragoza
+from torchtransient.files.captures import (
+    cdt,
+    dirac,
+    keyhole,
+    own,
+    phasor_field,
+    rect_data,
+    tal,
+    tmf8828,
+    vl53l8,
+    zaragoza,
+)
 from torchtransient.files.captures.contents import WHAT, Contents, opened
-from torchtransient.files.captures.gaps import Gaps
+from torchtransient.files.captures.reading import Reading
 
 OWN = "torchtransient"
-# Modules with `NAME`, `ENDINGS` of the files, `recognises(contents)`, `read(contents, gaps)`, and, unless they are only
-# read, `write(target, capture)`. In the order in which they are tried: names of variables that say most come first.
+# Modules with `NAME`, `ENDINGS` of the files, `recognises(contents)`, `read(contents, reading)`, and, unless they are
+# only read, `write(target, capture)`. In the order in which they are tried: names that say most come first.
 _MODULES = (
     tal, zaragoza, dirac, phasor_field, keyhole, rect_data, cdt, tmf8828, vl53l8,
 )  # fmt: skip
@@ -75,13 +85,13 @@ def read_capture(
     _check_name(format, FORMATS)
     source = path_of(path, WHAT)
     if format == OWN or (format is None and _is_own(source)):
-        Gaps(given, OWN, source).check_all_used()
-        return capture_file.read_capture(source)
+        Reading(given, OWN, source).check_all_used()
+        return own.read_capture(source)
     with opened(source) as contents:
         layout = _found(contents) if format is None else _asked_for(contents, format)
-        gaps = Gaps(given, layout.NAME, source)
-        capture: Capture = layout.read(contents, gaps)
-        gaps.check_all_used()
+        reading = Reading(given, layout.NAME, source)
+        capture: Capture = layout.read(contents, reading)
+        reading.check_all_used()
         return capture
 
 
@@ -105,7 +115,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
     """
     _check_name(format, FORMATS)
     if format == OWN:
-        return capture_file.write_capture(path, capture, metadata)
+        return own.write_capture(path, capture, metadata)
     layout = LAYOUTS[format]
     if not hasattr(layout, "write"):
         names = ", ".join([OWN, *(name for name, entry in LAYOUTS.items() if hasattr(entry, "write"))])

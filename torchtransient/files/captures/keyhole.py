@@ -12,7 +12,7 @@ import numpy as np
 
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import Contents
-from torchtransient.files.captures.gaps import Gaps, flat_scan, numbers_in, tensor_of, time_axis
+from torchtransient.files.captures.reading import Reading, flat_scan, numbers_in, tensor_of, time_axis
 
 NAME = "keyhole"
 ENDINGS = (".mat",)
@@ -30,13 +30,13 @@ def recognises(contents: Contents) -> bool:
     return names >= {"data", "xpos", "zpos"} or bool(names & set(_OTHERS))
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return a confocal capture of points ``(-xpos, 0, zpos)``: the wall's point in the frame of the object, which lies
     on the side of +z.
 
     Args:
         contents: the file.
-        gaps: arguments of the reader.
+        reading: arguments of the reader.
 
     Returns:
         The capture; ``metadata`` hold ``xpos`` and ``zpos`` of the file.
@@ -45,20 +45,20 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         StorageError: for wrong entries.
     """
     name = "data" if "data" in contents.shapes else next((name for name in _OTHERS if name in contents.shapes), "data")
-    data = numbers_in(contents, name, gaps, 2)
+    data = numbers_in(contents, name, reading, 2)
     if name != "data":
         data = data.T
     track = {}
     for part in ("xpos", "zpos") if name == "data" else ():
-        array = numbers_in(contents, part, gaps)
+        array = numbers_in(contents, part, reading)
         if array.size != len(data):
-            raise gaps.error(f"expected {part} for each of the {len(data)} rows of data.")
+            raise reading.error(f"expected {part} for each of the {len(data)} rows of data.")
         track[part] = array.reshape(-1).astype(np.float64)
     points = np.zeros((len(data), 3))
     if track:
         points[:, 0], points[:, 2] = -track["xpos"], track["zpos"]
-    axis = time_axis(gaps, None, None, data.shape[1], BIN_WIDTH_S)
-    scan = flat_scan("confocal", points, gaps)
+    axis = time_axis(reading, None, None, data.shape[1], BIN_WIDTH_S)
+    scan = flat_scan("confocal", points, reading)
     left = sorted(set(contents.shapes) - {name, *track})
-    metadata = gaps.metadata(**{part: array.tolist() for part, array in track.items()}, not_read=left or None)
+    metadata = reading.metadata(**{part: array.tolist() for part, array in track.items()}, not_read=left or None)
     return Capture(tensor_of(data).transpose(0, 1)[None], axis, scan, metadata=metadata)

@@ -18,19 +18,17 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import array_of
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import WHAT, Contents
-from torchtransient.files.captures.gaps import (
-    Gaps,
-    cannot,
-    hidden_volume,
+from torchtransient.files.captures.matlab import write_mat
+from torchtransient.files.captures.reading import (
+    Reading,
     numbers_in,
-    only_transient,
     optional_number,
     real_in,
     scan_of,
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.matlab import write_mat
+from torchtransient.files.captures.writing import cannot, hidden_volume, only_transient
 
 NAME = "phasor_field"
 ENDINGS = (".mat",)
@@ -48,12 +46,12 @@ def recognises(contents: Contents) -> bool:
     return "dataset" in contents.shapes and contents.fields("dataset") >= _REQUIRED
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return a single capture of a list of points, or all pairs of two lists.
 
     Args:
         contents: the file.
-        gaps: arguments of the reader.
+        reading: arguments of the reader.
 
     Returns:
         The capture; ``metadata["reciprocal"]`` is True if camera and laser have changed places, ``hidden_volume`` has
@@ -62,16 +60,16 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     Raises:
         StorageError: for wrong entries.
     """
-    data = numbers_in(contents, "dataset/data", gaps, 3)
-    points = {who: _points(contents, f"{who}Pos", gaps) for who in ("camera", "laser")}
-    normals = {who: _normals(contents, f"{who}Norm", points[who], gaps) for who in points}
-    bins = _number(contents, "t", gaps)
+    data = numbers_in(contents, "dataset/data", reading, 3)
+    points = {who: _points(contents, f"{who}Pos", reading) for who in ("camera", "laser")}
+    normals = {who: _normals(contents, f"{who}Norm", points[who], reading) for who in points}
+    bins = _number(contents, "t", reading)
     if bins not in (None, len(data)):
-        raise gaps.error(f"dataset.t says {bins:g} bins, dataset.data {data.shape} has {len(data)}.")
+        raise reading.error(f"dataset.t says {bins:g} bins, dataset.data {data.shape} has {len(data)}.")
     reciprocal = data.shape[1] == 1
     sensor, laser = ("laser", "camera") if reciprocal else ("camera", "laser")
     sensor_origin, laser_origin = (
-        gaps.origin(f"{ours}_origin", _field(contents, f"{who}Origin", gaps), points[who], normals[who], True)
+        reading.origin(f"{ours}_origin", _field(contents, f"{who}Origin", reading), points[who], normals[who], True)
         for ours, who in (("sensor", sensor), ("laser", laser))
     )
     spots, spot_normals = points[laser], normals[laser]
@@ -81,36 +79,38 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     scan = scan_of(kind, points[sensor], spots, sensor_origin, laser_origin, normals[sensor], spot_normals, legs=True)
     tensor = tensor_of(data)
     tensor = tensor[:, 0] if reciprocal else tensor.transpose(1, 2)
-    axis = time_axis(gaps, _number(contents, "t0", gaps), _number(contents, "deltat", gaps), len(data))
+    axis = time_axis(reading, _number(contents, "t0", reading), _number(contents, "deltat", reading), len(data))
     volume = {name: array.reshape(-1).tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
     fields = {f"dataset/{name}" for name in contents.fields("dataset") - _FIELDS}
     left = sorted(fields | set(contents.shapes) - {"dataset", *_VOLUME})
-    metadata = gaps.metadata(reciprocal=reciprocal, hidden_volume=volume or None, not_read=left or None)
+    metadata = reading.metadata(reciprocal=reciprocal, hidden_volume=volume or None, not_read=left or None)
     return Capture(tensor[None], axis, scan, metadata=metadata)
 
 
-def _field(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:
-    return real_in(contents, f"dataset/{name}", gaps) if name in contents.fields("dataset") else None
+def _field(contents: Contents, name: str, reading: Reading) -> NDArray[Any] | None:
+    return real_in(contents, f"dataset/{name}", reading) if name in contents.fields("dataset") else None
 
 
-def _points(contents: Contents, name: str, gaps: Gaps) -> NDArray[np.float64]:
-    array = _field(contents, name, gaps)
+def _points(contents: Contents, name: str, reading: Reading) -> NDArray[np.float64]:
+    array = _field(contents, name, reading)
     if array is None or array.ndim != 2 or 3 not in array.shape:
-        raise gaps.error(f"expected dataset.{name} (3, N), got {None if array is None else array.shape}.")
+        raise reading.error(f"expected dataset.{name} (3, N), got {None if array is None else array.shape}.")
     return np.ascontiguousarray(array.T if array.shape[0] == 3 else array, np.float64)
 
 
-def _normals(contents: Contents, name: str, points: NDArray[Any], gaps: Gaps) -> NDArray[np.float64] | None:
+def _normals(contents: Contents, name: str, points: NDArray[Any], reading: Reading) -> NDArray[np.float64] | None:
     if name not in contents.fields("dataset"):
         return None
-    found = _points(contents, name, gaps)
+    found = _points(contents, name, reading)
     if found.shape not in (points.shape, (1, 3)):
-        raise gaps.error(f"expected dataset.{name} one, or for each of the points {points.shape}, got {found.shape}.")
+        raise reading.error(
+            f"expected dataset.{name} one, or for each of the points {points.shape}, got {found.shape}."
+        )
     return np.ascontiguousarray(np.broadcast_to(found, points.shape))
 
 
-def _number(contents: Contents, name: str, gaps: Gaps) -> float | None:
-    return optional_number(contents, f"dataset/{name}", gaps) if name in contents.fields("dataset") else None
+def _number(contents: Contents, name: str, reading: Reading) -> float | None:
+    return optional_number(contents, f"dataset/{name}", reading) if name in contents.fields("dataset") else None
 
 
 def write(target: Path, capture: Capture) -> None:

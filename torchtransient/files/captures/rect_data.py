@@ -20,19 +20,17 @@ from torchtransient.array_files.array_file import array_of
 from torchtransient.capture import Capture
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.contents import WHAT, Contents
-from torchtransient.files.captures.gaps import (
-    Gaps,
-    cannot,
+from torchtransient.files.captures.matlab import write_mat
+from torchtransient.files.captures.reading import (
+    Reading,
     flat_scan,
     grid_points,
-    hidden_side,
     numbers_in,
-    only_transient,
     optional_number,
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.matlab import write_mat
+from torchtransient.files.captures.writing import cannot, hidden_side, only_transient
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 NAME = "rect_data"
@@ -51,13 +49,13 @@ def recognises(contents: Contents) -> bool:
     return contents.shapes.get("rect_data") is not None or square
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return a confocal capture, or with ``SPAD_index`` a single one, on the plane z = 0 around the origin, hidden side
     +z.
 
     Args:
         contents: the file.
-        gaps: arguments of the reader, for values that the file lacks: ``bin_width_s=`` (4 ps for the data of the
+        reading: arguments of the reader, for values that the file lacks: ``bin_width_s=`` (4 ps for the data of the
             light-cone transform, 32 ps for those of f-k migration), ``wall_size=``. Origins are assumed: their
             distances do not count.
 
@@ -65,42 +63,42 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         StorageError: for wrong entries and missing arguments.
     """
     name = "rect_data" if "rect_data" in contents.shapes else "meas"
-    data = numbers_in(contents, name, gaps, 3)
+    data = numbers_in(contents, name, reading, 3)
     spad = contents.array("SPAD_index")
     tensor = tensor_of(data)
     tensor = tensor if name == "rect_data" and spad is None else tensor.transpose(1, 2)
     size = tensor.shape[1], tensor.shape[2]
-    width, ts = _positive(contents, "width", gaps), _positive(contents, "ts", gaps)
-    spacing = _positive(contents, "sampling_spacing", gaps)
+    width, ts = _positive(contents, "width", reading), _positive(contents, "ts", reading)
+    spacing = _positive(contents, "sampling_spacing", reading)
     if width is not None and spacing is not None and abs(size[1] * spacing - 2 * width) > 1.01 * spacing:
-        raise gaps.error(
+        raise reading.error(
             f"width says that the scan is {2 * width:g} m wide, sampling_spacing {size[1] * spacing:g} m. Correct one "
             "of them in the file."
         )
     # Where both are there, by a cell apart, each goes with its own layout.
     side = None if width is None else (2 * width, 2 * width)
     side = (size[1] * spacing, size[0] * spacing) if spacing is not None and (spad is not None or not side) else side
-    points = grid_points(size, gaps.extent(side))
-    spot = None if spad is None else points[_index(spad, size, gaps)]
-    scan = flat_scan("confocal" if spot is None else "single", points, gaps, spot)
-    axis = time_axis(gaps, None, None if ts is None else seconds_to_opl(ts), len(data))
+    points = grid_points(size, reading.extent(side))
+    spot = None if spad is None else points[_index(spad, size, reading)]
+    scan = flat_scan("confocal" if spot is None else "single", points, reading, spot)
+    axis = time_axis(reading, None, None if ts is None else seconds_to_opl(ts), len(data))
     left = sorted(set(contents.shapes) - {name, "width", "ts", "sampling_spacing", "SPAD_index"})
-    metadata = gaps.metadata(not_read=left or None)
+    metadata = reading.metadata(not_read=left or None)
     return Capture(tensor[None], axis, scan, metadata=metadata)
 
 
-def _positive(contents: Contents, name: str, gaps: Gaps) -> float | None:
-    value = optional_number(contents, name, gaps)
+def _positive(contents: Contents, name: str, reading: Reading) -> float | None:
+    value = optional_number(contents, name, reading)
     if value is not None and not (np.isfinite(value) and value > 0):
-        raise gaps.error(f"expected {name} as one number above zero, got {value!r}.")
+        raise reading.error(f"expected {name} as one number above zero, got {value!r}.")
     return value
 
 
-def _index(spad: NDArray[Any], size: tuple[int, int], gaps: Gaps) -> tuple[int, int]:
+def _index(spad: NDArray[Any], size: tuple[int, int], reading: Reading) -> tuple[int, int]:
     numbers = spad.reshape(-1).tolist()
     whole = [int(n) for n in numbers if not isinstance(n, complex) and n == np.floor(n)]
     if len(numbers) != 2 or len(whole) != 2 or not (0 <= whole[0] < size[1] and 0 <= whole[1] < size[0]):
-        raise gaps.error(f"expected SPAD_index (x, y) below {size[::-1]}, got {numbers[:4]}.")
+        raise reading.error(f"expected SPAD_index (x, y) below {size[::-1]}, got {numbers[:4]}.")
     return whole[1], whole[0]
 
 

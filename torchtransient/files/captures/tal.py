@@ -27,12 +27,9 @@ from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.contents import WHAT, Contents
-from torchtransient.files.captures.gaps import (
-    Gaps,
-    assumed_in,
-    cannot,
+from torchtransient.files.captures.reading import (
+    Reading,
     frequency_axis,
-    one_channel,
     optional_number,
     real_in,
     same_points,
@@ -40,6 +37,7 @@ from torchtransient.files.captures.gaps import (
     tensor_of,
     time_axis,
 )
+from torchtransient.files.captures.writing import assumed_in, cannot, one_channel
 from torchtransient.files.plain_data import flag_of, plain, restored, whole_of
 from torchtransient.plugins.films.transform_bins import transform_bins
 
@@ -86,12 +84,12 @@ def recognises(contents: Contents) -> bool:
 # ------------------------------------------------------------------------------------------------------------- reading
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return the capture of a file of y-tal.
 
     Args:
         contents: the file.
-        gaps: arguments of the reader. Missing origins are assumed if their distance does not count.
+        reading: arguments of the reader. Missing origins are assumed if their distance does not count.
 
     Returns:
         The capture; ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` the settings with which a file
@@ -104,8 +102,8 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     number = _one(contents, "H_format", whole_of)
     form = next((name for name, known in _NUMBERS.items() if known == number), "UNKNOWN")
     if form == "UNKNOWN":
-        raise gaps.error(f"expected H_format to be one of the numbers {list(_NUMBERS.values())[1:]}, got {number}.")
-    measured = _measured(contents, gaps, form)
+        raise reading.error(f"expected H_format to be one of the numbers {list(_NUMBERS.values())[1:]}, got {number}.")
+    measured = _measured(contents, reading, form)
     kept: dict[str, Any] = {"dtypes": {"H": measured.dtype.str}}
     for name in _NUMBERS_OF_FILES:
         if (array := contents.array(name)) is not None:
@@ -113,30 +111,30 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     text = contents.text("scene_info")
     info = None if text is None else _scene_info(text)
     own = _own_part(info)
-    legs = gaps.fill(_LEGS, _one(contents, _LEGS, flag_of), False)
-    scan = _scan(contents, gaps, form, legs)
+    legs = reading.fill(_LEGS, _one(contents, _LEGS, flag_of), False)
+    scan = _scan(contents, reading, form, legs)
     polarized = measured.ndim > _dims(form)
-    start, width = optional_number(contents, "t_start", gaps), optional_number(contents, "delta_t", gaps)
+    start, width = optional_number(contents, "t_start", reading), optional_number(contents, "delta_t", reading)
     settings: dict[str, Any] = {"scan": scan, "polarized": polarized}
     tensor = _swapped(tensor_of(measured), form)
     tensor = tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
     if form.startswith("F"):
         found = _frequencies(info, own, len(measured), start)
-        axis = frequency_axis(gaps, found)
+        axis = frequency_axis(reading, found)
         if start is not None and axis.start_opl != start:
-            raise gaps.error(
+            raise reading.error(
                 f"t_start says that phases count from {start!r} m, the frequencies from {axis.start_opl!r} m. Give "
                 f"frequencies=FrequencyAxis(..., start_opl={start!r})."
             )
         settings |= {"transient": None, "axis": None, "phasor": tensor, "frequencies": axis}
         kept |= {"delta_t": width}
     else:
-        settings |= {"transient": tensor, "axis": time_axis(gaps, start, width, len(measured))}
+        settings |= {"transient": tensor, "axis": time_axis(reading, start, width, len(measured))}
     left = sorted(set(contents.shapes) - _KNOWN)
     if own is not None:
-        return Capture(**(settings | _of_ours(own, scan, gaps.assumed, left)))
+        return Capture(**(settings | _of_ours(own, scan, reading.assumed, left)))
     kept |= {"scene_info_text": text, "volume_format": _one(contents, "volume_format", whole_of)}
-    return Capture(**settings, metadata=gaps.metadata(scene_info=info, tal=kept, not_read=left or None))
+    return Capture(**settings, metadata=reading.metadata(scene_info=info, tal=kept, not_read=left or None))
 
 
 def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], left: list[str]) -> dict[str, Any]:
@@ -158,14 +156,16 @@ def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], lef
     }  # fmt: skip
 
 
-def _measured(contents: Contents, gaps: Gaps, form: str) -> NDArray[Any]:
+def _measured(contents: Contents, reading: Reading, form: str) -> NDArray[Any]:
     array = contents.array("H")
     if array is None:
-        raise gaps.error("H is missing or empty.")
+        raise reading.error("H is missing or empty.")
     if array.ndim != _dims(form) and not (array.ndim == _dims(form) + 1 and array.shape[-1] == _STOKES):
-        raise gaps.error(f"expected H with {_dims(form)} dimensions as H_format says, got {array.shape}.")
+        raise reading.error(f"expected H with {_dims(form)} dimensions as H_format says, got {array.shape}.")
     if (array.dtype.kind == "c") != form.startswith("F"):
-        raise gaps.error(f"expected {'complex' if form.startswith('F') else 'real'} numbers in H, got {array.dtype}.")
+        raise reading.error(
+            f"expected {'complex' if form.startswith('F') else 'real'} numbers in H, got {array.dtype}."
+        )
     return array
 
 
@@ -180,60 +180,60 @@ def _swapped(tensor: Tensor, form: str) -> Tensor:
     return tensor.transpose(1, 2).transpose(3, 4) if "L" in form else tensor.transpose(1, 2)
 
 
-def _scan(contents: Contents, gaps: Gaps, form: str, legs: bool) -> Scan:
-    points = {who: _points(contents, gaps, f"{who}_grid_xyz") for who in ("sensor", "laser")}
-    normals = {who: _normals(contents, gaps, who, points[who]) for who in ("sensor", "laser")}
+def _scan(contents: Contents, reading: Reading, form: str, legs: bool) -> Scan:
+    points = {who: _points(contents, reading, f"{who}_grid_xyz") for who in ("sensor", "laser")}
+    normals = {who: _normals(contents, reading, who, points[who]) for who in ("sensor", "laser")}
     for who in points:
         # UNKNOWN, 0, is what y-tal makes of a format that is missing.
         said = _one(contents, f"{who}_grid_format", whole_of)
         if said not in (None, 0, points[who].ndim - 1):
-            raise gaps.error(f"{who}_grid_format says {said}, the points are {points[who].shape}.")
-    kind = _kind(points["sensor"], points["laser"], form, gaps)
+            raise reading.error(f"{who}_grid_format says {said}, the points are {points[who].shape}.")
+    kind = _kind(points["sensor"], points["laser"], form, reading)
     if kind == "single":
         points["laser"] = points["laser"].reshape(3)
         normals["laser"] = None if normals["laser"] is None else normals["laser"].reshape(3)
     elif kind == "confocal":
         points["laser"] = points["sensor"]
     origins = {
-        who: gaps.origin(f"{who}_origin", real_in(contents, f"{who}_xyz", gaps), points[who], normals[who], legs)
+        who: reading.origin(f"{who}_origin", real_in(contents, f"{who}_xyz", reading), points[who], normals[who], legs)
         for who in points
     }
     return scan_of(kind, *points.values(), *origins.values(), *normals.values(), legs=legs)
 
 
-def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: str, gaps: Gaps) -> str:
+def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: str, reading: Reading) -> str:
     if "L" in form:
         return "exhaustive"
     if sensor.shape == laser.shape:
         # Not what y-tal takes for confocal, which depends on where the origin of coordinates is.
         if same_points(sensor, laser):
             if not np.array_equal(sensor, laser):
-                gaps.assumed["laser_grid_xyz"] = "that of the sensor"
+                reading.assumed["laser_grid_xyz"] = "that of the sensor"
             return "confocal"
         if laser.size != 3:
             return "pairs"
     if laser.size != 3:
-        raise gaps.error(
+        raise reading.error(
             f"expected one laser point, or those of the sensor {sensor.shape}, as H has no laser dimensions, got "
             f"{laser.shape}."
         )
     return "single"
 
 
-def _points(contents: Contents, gaps: Gaps, name: str) -> NDArray[np.float64]:
-    array = real_in(contents, name, gaps)
+def _points(contents: Contents, reading: Reading, name: str) -> NDArray[np.float64]:
+    array = real_in(contents, name, reading)
     if array is None or array.ndim not in (2, 3) or array.shape[-1] != 3:
-        raise gaps.error(f"expected {name} (X, Y, 3) or (N, 3), got {None if array is None else array.shape}.")
+        raise reading.error(f"expected {name} (X, Y, 3) or (N, 3), got {None if array is None else array.shape}.")
     return np.ascontiguousarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
 
 
-def _normals(contents: Contents, gaps: Gaps, who: str, points: NDArray[Any]) -> NDArray[np.float64] | None:
+def _normals(contents: Contents, reading: Reading, who: str, points: NDArray[Any]) -> NDArray[np.float64] | None:
     name = f"{who}_grid_normals"
     if contents.array(name) is None:
         return None
-    found = _points(contents, gaps, name)
+    found = _points(contents, reading, name)
     if found.shape != points.shape:
-        raise gaps.error(f"expected {name} in the shape of the points, {points.shape}, got {found.shape}.")
+        raise reading.error(f"expected {name} in the shape of the points, {points.shape}, got {found.shape}.")
     return found
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import Contents, JsonContents
-from torchtransient.files.captures.gaps import Gaps, numbers_in, scan_of, tensor_of, time_axis, zone_grid
+from torchtransient.files.captures.reading import Reading, numbers_in, scan_of, tensor_of, time_axis, zone_grid
 
 NAME = "tmf8828"
 ENDINGS = (".json",)
@@ -42,7 +42,7 @@ def recognises(contents: Contents) -> bool:
     return set(contents.shapes) >= {"hists", "reference_hist"}
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return a confocal capture of one frame, with the legs from and to the chip.
 
     Points are where the zones meet the plane ``dist_to_plane`` in front of the chip, without that as far as each zone's
@@ -50,25 +50,25 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
     Args:
         contents: the file.
-        gaps: arguments of the reader; ``frame=`` chooses one of several.
+        reading: arguments of the reader; ``frame=`` chooses one of several.
 
     Raises:
         StorageError: for wrong entries, and if neither distance is there.
     """
-    hists = numbers_in(contents, "hists", gaps, 3)
+    hists = numbers_in(contents, "hists", reading, 3)
     frames, zones, bins = hists.shape
-    chosen = gaps.frame(frames)
-    axis = time_axis(gaps, None, None, bins, BIN_WIDTH_S, start_bins=-ZERO_BIN)
-    pose = _pose(contents, chosen, gaps)
+    chosen = reading.frame(frames)
+    axis = time_axis(reading, None, None, bins, BIN_WIDTH_S, start_bins=-ZERO_BIN)
+    pose = _pose(contents, chosen, reading)
     shape = zone_grid(zones)
-    gaps.assumed["half_field_tangents"] = list(HALF_FIELD)
-    points, normals = _points(contents, chosen, shape, pose, gaps)
+    reading.assumed["half_field_tangents"] = list(HALF_FIELD)
+    points, normals = _points(contents, chosen, shape, pose, reading)
     origin = pose[:3, 3]
     scan = scan_of("confocal", points, points, origin, origin, normals, normals, legs=True)
     kept = {name: entry for name in _KEPT if (entry := _entry(contents, name, chosen)) is not None}
     left = sorted(set(contents.shapes) - {"hists", "distances", *_KEPT})
     transient = tensor_of(np.ascontiguousarray(hists[chosen].T)).reshape(1, bins, *shape)
-    return Capture(transient, axis, scan, metadata=gaps.metadata(frame=chosen, **kept, not_read=left or None))
+    return Capture(transient, axis, scan, metadata=reading.metadata(frame=chosen, **kept, not_read=left or None))
 
 
 def _entry(contents: Contents, name: str, chosen: int) -> Any:
@@ -80,33 +80,35 @@ def _entry(contents: Contents, name: str, chosen: int) -> Any:
 
 
 def _points(
-    contents: Contents, chosen: int, shape: tuple[int, ...], pose: NDArray[np.float64], gaps: Gaps
+    contents: Contents, chosen: int, shape: tuple[int, ...], pose: NDArray[np.float64], reading: Reading
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Return points where the zones meet the wall (*shape, 3), and the wall's normals there."""
     rows, columns = shape if len(shape) > 1 else (shape[0], 1)
     x, y = (half * (2 * (np.arange(n) + 0.5) / n - 1) for half, n in zip(HALF_FIELD, (rows, columns), strict=True))
     ways = np.stack(np.broadcast_arrays(x[:, None], y[None, :], 1.0), -1) @ pose[:3, :3].T
     if contents.array("dist_to_plane") is not None:
-        distance = numbers_in(contents, "dist_to_plane", gaps, 1)[chosen]
+        distance = numbers_in(contents, "dist_to_plane", reading, 1)[chosen]
         depths = np.full((rows, columns), distance, np.float64)
         normals = np.broadcast_to(-pose[:3, 2], (*shape, 3))
     elif (measured := contents.array("distances/depths_1")) is not None:
         if measured.shape != (len(measured), rows * columns) or measured.dtype.kind not in "iuf":
-            raise gaps.error(f"expected depths_1 for each of {rows * columns} zones, got {measured.shape[1:]}.")
+            raise reading.error(f"expected depths_1 for each of {rows * columns} zones, got {measured.shape[1:]}.")
         depths, normals = _MM * measured[chosen].astype(np.float64).reshape(rows, columns), None
     else:
-        raise gaps.error("neither dist_to_plane nor depths_1 of distances says how far away the wall is.")
+        raise reading.error("neither dist_to_plane nor depths_1 of distances says how far away the wall is.")
     if not (np.isfinite(depths).all() and (depths > 0).all()):
-        raise gaps.error(f"expected distances above zero to where each zone meets the wall, got {depths.min():.4g} m.")
+        raise reading.error(
+            f"expected distances above zero to where each zone meets the wall, got {depths.min():.4g} m."
+        )
     return (pose[:3, 3] + depths[..., None] * ways).reshape(*shape, 3), normals
 
 
-def _pose(contents: Contents, chosen: int, gaps: Gaps) -> NDArray[np.float64]:
+def _pose(contents: Contents, chosen: int, reading: Reading) -> NDArray[np.float64]:
     if contents.array("pose") is None:
-        gaps.assumed["pose"] = np.eye(4).tolist()
+        reading.assumed["pose"] = np.eye(4).tolist()
         return np.eye(4)
-    pose: NDArray[np.float64] = numbers_in(contents, "pose", gaps, 3)[chosen].astype(np.float64)
+    pose: NDArray[np.float64] = numbers_in(contents, "pose", reading, 3)[chosen].astype(np.float64)
     turn = pose[:3, :3]
     if pose.shape != (4, 4) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
-        raise gaps.error("expected pose as a turn and a shift (4, 4).")
+        raise reading.error("expected pose as a turn and a shift (4, 4).")
     return pose

@@ -12,8 +12,8 @@ import numpy as np
 
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import Contents
-from torchtransient.files.captures.gaps import (
-    Gaps,
+from torchtransient.files.captures.reading import (
+    Reading,
     flat_scan,
     numbers_in,
     optional_number,
@@ -37,25 +37,25 @@ def recognises(contents: Contents) -> bool:
     return set(contents.shapes) >= {"hists", "pt_cloud"}
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return a confocal capture of the zones: a grid if they are 4 x 4 or another square, rows in the file's order,
     else a list.
 
     Args:
         contents: the file.
-        gaps: arguments of the reader.
+        reading: arguments of the reader.
 
     Raises:
         StorageError: for wrong entries.
     """
-    data, points = numbers_in(contents, "hists", gaps, 2), numbers_in(contents, "pt_cloud", gaps, 2)
+    data, points = numbers_in(contents, "hists", reading, 2), numbers_in(contents, "pt_cloud", reading, 2)
     if points.shape != (len(data), 3):
-        raise gaps.error(f"expected pt_cloud ({len(data)}, 3), got {points.shape}.")
-    height = optional_number(contents, "cam_z", gaps)
+        raise reading.error(f"expected pt_cloud ({len(data)}, 3), got {points.shape}.")
+    height = optional_number(contents, "cam_z", reading)
     origin = None if height is None else np.array([0.0, 0.0, height])
     zones = zone_grid(len(data))
-    axis = time_axis(gaps, None, None, data.shape[1], BIN_WIDTH_S)
-    scan = flat_scan("confocal", points.astype(np.float64).reshape(*zones, 3), gaps, origin=origin)
+    axis = time_axis(reading, None, None, data.shape[1], BIN_WIDTH_S)
+    scan = flat_scan("confocal", points.astype(np.float64).reshape(*zones, 3), reading, origin=origin)
     left = sorted(set(contents.shapes) - _KNOWN)
     transient = tensor_of(data).T.reshape(1, data.shape[1], *zones)
-    return Capture(transient, axis, scan, metadata=gaps.metadata(not_read=left or None))
+    return Capture(transient, axis, scan, metadata=reading.metadata(not_read=left or None))

@@ -21,11 +21,8 @@ from torchtransient.capture import Capture
 from torchtransient.checks import shown
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.contents import WHAT, Contents
-from torchtransient.files.captures.gaps import (
-    Gaps,
-    cannot,
-    hidden_volume,
-    only_transient,
+from torchtransient.files.captures.reading import (
+    Reading,
     optional_number,
     real_in,
     same_points,
@@ -33,6 +30,7 @@ from torchtransient.files.captures.gaps import (
     tensor_of,
     time_axis,
 )
+from torchtransient.files.captures.writing import cannot, hidden_volume, only_transient
 
 NAME = "zaragoza"
 ENDINGS = HDF5
@@ -60,12 +58,12 @@ def recognises(contents: Contents) -> bool:
     return set(contents.shapes) >= _REQUIRED
 
 
-def read(contents: Contents, gaps: Gaps) -> Capture:
+def read(contents: Contents, reading: Reading) -> Capture:
     """Return the capture, colours as channels, bounces summed up. Single captures are pairs with one spot.
 
     Args:
         contents: the file.
-        gaps: arguments of the reader.
+        reading: arguments of the reader.
 
     Returns:
         The capture; ``metadata`` hold the number of ``bounces`` and ``hidden_volume``: position, rotation, size.
@@ -75,15 +73,15 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     """
     missing = sorted(_REQUIRED - set(contents.shapes))
     if missing:
-        raise gaps.error(f"expected {', '.join(missing)}, got {', '.join(contents.shapes) or 'nothing'}.")
-    transient, bounces = _summed(contents, gaps)
-    sensor, laser = (_grid(contents, f"{who}GridPositions", gaps) for who in ("camera", "laser"))
+        raise reading.error(f"expected {', '.join(missing)}, got {', '.join(contents.shapes) or 'nothing'}.")
+    transient, bounces = _summed(contents, reading)
+    sensor, laser = (_grid(contents, f"{who}GridPositions", reading) for who in ("camera", "laser"))
     if sensor is None or laser is None:
-        raise gaps.error("expected cameraGridPositions and laserGridPositions, got an empty one.")
-    sensor_normals = _grid(contents, "cameraGridNormals", gaps, sensor)
-    laser_normals = _grid(contents, "laserGridNormals", gaps, laser)
-    sensor_origin = gaps.origin("sensor_origin", contents.array("cameraPosition"), sensor, sensor_normals, True)
-    laser_origin = gaps.origin("laser_origin", contents.array("laserPosition"), laser, laser_normals, True)
+        raise reading.error("expected cameraGridPositions and laserGridPositions, got an empty one.")
+    sensor_normals = _grid(contents, "cameraGridNormals", reading, sensor)
+    laser_normals = _grid(contents, "laserGridNormals", reading, laser)
+    sensor_origin = reading.origin("sensor_origin", contents.array("cameraPosition"), sensor, sensor_normals, True)
+    laser_origin = reading.origin("laser_origin", contents.array("laserPosition"), laser, laser_normals, True)
     alone = transient.ndim == _CONFOCAL and same_points(sensor, laser)
     kind = "confocal" if alone else "single" if laser.size == 3 else "exhaustive"
     if kind == "single":
@@ -91,16 +89,16 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         laser, laser_normals = laser.reshape(3), None if laser_normals is None else laser_normals.reshape(3)
     elif kind == "confocal":
         if not np.array_equal(sensor, laser):
-            gaps.assumed["laserGridPositions"] = "those of the camera"
+            reading.assumed["laserGridPositions"] = "those of the camera"
         laser, laser_normals = sensor, sensor_normals
     elif transient.ndim == _CONFOCAL:
-        raise gaps.error("expected laserGridPositions one, or those of the camera: data has no laser axes.")
+        raise reading.error("expected laserGridPositions one, or those of the camera: data has no laser axes.")
     scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, legs=True)
-    start, width = (optional_number(contents, name, gaps) for name in ("t0", "deltaT"))
-    axis = time_axis(gaps, start, width, transient.shape[1])
+    start, width = (optional_number(contents, name, reading) for name in ("t0", "deltaT"))
+    axis = time_axis(reading, start, width, transient.shape[1])
     volume = {name: array.tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
     left = sorted(set(contents.shapes) - _KNOWN)
-    metadata = gaps.metadata(bounces=bounces, hidden_volume=volume or None, not_read=left or None)
+    metadata = reading.metadata(bounces=bounces, hidden_volume=volume or None, not_read=left or None)
     return Capture(transient, axis, scan, metadata=metadata)
 
 
@@ -111,32 +109,32 @@ def _reversed(contents: Contents) -> bool:
     return order == "row-major"
 
 
-def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
+def _summed(contents: Contents, reading: Reading) -> tuple[torch.Tensor, int]:
     """Return (C, T, [Ly, Lx,] Sy, Sx), summed a bounce at a time: all of them would take several times the memory."""
     shape = contents.shapes["data"]
     if shape is None or len(shape) not in (4, 5, 6, 7):
-        raise gaps.error(f"expected data with 4 to 7 dimensions, got {shape}.")
+        raise reading.error(f"expected data with 4 to 7 dimensions, got {shape}.")
     colours = len(shape) % 2  # 5 and 7 have them
     backwards = _reversed(contents)
     place = colours + 1
     low = high = 0
     bounce_axis = len(shape) - 1 - place if backwards else place
     if shape[bounce_axis] > _MOST_BOUNCES:
-        raise gaps.error(f"expected at most {_MOST_BOUNCES} bounces in data, got {shape[bounce_axis]} of {shape}.")
+        raise reading.error(f"expected at most {_MOST_BOUNCES} bounces in data, got {shape[bounce_axis]} of {shape}.")
     total: NDArray[Any] | None = None
     for bounce in range(shape[bounce_axis]):
         part = contents.array("data", (slice(None),) * bounce_axis + (bounce,))
         if part is None:
             break
         if part.dtype.kind not in "iuf":
-            raise gaps.error(f"expected real numbers in data, got {part.dtype}.")
+            raise reading.error(f"expected real numbers in data, got {part.dtype}.")
         # Counts of a few bits would overflow, and so would half precision.
         if part.dtype.kind == "f":
             part = part.astype(np.result_type(part, np.float32), copy=False)
         else:
             low, high = low + min(0, int(part.min())), high + max(0, int(part.max()))
             if low < -_INT64 or high >= _INT64:
-                raise gaps.error("expected counts whose sum over the bounces is below 2^63, got more.")
+                raise reading.error("expected counts whose sum over the bounces is below 2^63, got more.")
             part = part.astype(np.int64)
         if total is None:
             total = part
@@ -144,7 +142,7 @@ def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
             with np.errstate(all="ignore"):
                 total += part
     if total is None:
-        raise gaps.error("data is empty.")
+        raise reading.error("data is empty.")
     tensor = tensor_of(total)
     tensor = tensor.permute(*reversed(range(tensor.ndim))) if backwards else tensor
     tensor = tensor if colours else tensor.unsqueeze(0)
@@ -153,9 +151,11 @@ def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
     return tensor, shape[bounce_axis]
 
 
-def _grid(contents: Contents, name: str, gaps: Gaps, like: NDArray[Any] | None = None) -> NDArray[np.float64] | None:
+def _grid(
+    contents: Contents, name: str, reading: Reading, like: NDArray[Any] | None = None
+) -> NDArray[np.float64] | None:
     """Return (Y, X, 3), from (3, X, Y), or (Y, X, 3) in files that have their axes the other way round."""
-    array = real_in(contents, name, gaps)
+    array = real_in(contents, name, reading)
     if array is None:
         return None
     if not _reversed(contents):
@@ -163,9 +163,9 @@ def _grid(contents: Contents, name: str, gaps: Gaps, like: NDArray[Any] | None =
     if array.ndim == 1:
         array = array.reshape(1, 1, -1)
     if array.ndim != 3 or array.shape[-1] != 3:
-        raise gaps.error(f"expected {name} as a grid of points, got {array.shape}.")
+        raise reading.error(f"expected {name} as a grid of points, got {array.shape}.")
     if like is not None and array.shape != like.shape:
-        raise gaps.error(f"expected {name} for each of the points {like.shape[:-1]}, got {array.shape[:-1]}.")
+        raise reading.error(f"expected {name} for each of the points {like.shape[:-1]}, got {array.shape[:-1]}.")
     return np.ascontiguousarray(array, np.float64)
 
 

@@ -1,4 +1,4 @@
-"""Captures around a corner on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+"""Captures in the library's own layout: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
 Both hold the same names, arrays in torch's order as :class:`~torchtransient.capture.Capture` has them: `transient` (C,
 T, ...) with `start_opl`, `bin_width_opl` (metres of optical path), `num_bins`; `phasor` (C, F, ...) with

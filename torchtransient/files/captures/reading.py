@@ -1,5 +1,5 @@
-"""Values that a file leaves open, filled by its reader's arguments or by assumptions that the capture's metadata name;
-and the parts of a capture that layouts have in common.
+"""What readers of layouts have in common: values that a file leaves open, filled by arguments or by assumptions that
+the capture's metadata name; checked numbers of a file; axes and scans made of them.
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient.array_files.array_file import array_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.capture import Capture, Scan
+from torchtransient.capture import Scan
 from torchtransient.checks import as_whole, finite, positive, real_array, shown
 from torchtransient.errors import StorageError
-from torchtransient.files.capture_file import POINTS
 from torchtransient.files.captures.contents import WHAT, Contents
+from torchtransient.files.captures.own import POINTS
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 _NEEDED = object()
@@ -34,8 +33,8 @@ _MOST, _MOST_BYTES = 2**63 - 1, 8
 _SIGNED = {np.dtype(np.uint16): np.int32, np.dtype(np.uint32): np.int64, np.dtype(np.uint64): np.int64}
 
 
-class Gaps:
-    """Arguments of a reader of one file, and what was assumed in their place.
+class Reading:
+    """One reading of a file: arguments of the caller, and what was assumed in their place.
 
     Args:
         given: values by the names of :func:`read_capture`'s arguments.
@@ -107,7 +106,7 @@ class Gaps:
             legs: the distance counts, so that a missing place is an error; otherwise one before the middle of the
                 points is assumed.
         """
-        default = _NEEDED if legs else before(points, normals)
+        default = _NEEDED if legs else _before(points, normals)
         found = real_array(self.fill(name, None if stored is None else stored.reshape(-1), default))
         if found is None or found.shape != (3,):
             raise self.error(f"expected {name} (3,), got {shown(found)}.")
@@ -174,60 +173,60 @@ class Gaps:
         return StorageError(f"{WHAT}: '{self.source}', layout {self._layout!r}: {message}")
 
 
-def real_in(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:
+def real_in(contents: Contents, name: str, reading: Reading) -> NDArray[Any] | None:
     """Return an array of real numbers, None if it is missing or empty.
 
     Args:
         contents: the file.
         name: name of the array.
-        gaps: arguments of the reader, for messages.
+        reading: arguments of the reader, for messages.
 
     Raises:
         StorageError: for other numbers.
     """
     array = contents.array(name)
     if array is not None and array.dtype.kind not in "iuf":
-        raise gaps.error(f"expected real numbers in {name}, got {array.dtype}.")
+        raise reading.error(f"expected real numbers in {name}, got {array.dtype}.")
     return array
 
 
-def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = None) -> NDArray[Any]:
+def numbers_in(contents: Contents, name: str, reading: Reading, dims: int | None = None) -> NDArray[Any]:
     """Return an array of real numbers.
 
     Args:
         contents: the file.
         name: name of the array.
-        gaps: arguments of the reader, for messages.
+        reading: arguments of the reader, for messages.
         dims: number of its dimensions, None for any.
 
     Raises:
         StorageError: for anything else, and for an array that is missing or empty.
     """
-    array = real_in(contents, name, gaps)
+    array = real_in(contents, name, reading)
     if array is None or dims not in (None, array.ndim):
         got = "nothing" if array is None else f"{array.dtype} of {array.shape}"
-        raise gaps.error(f"expected {name} as real numbers{f' with {dims} dimensions' if dims else ''}, got {got}.")
+        raise reading.error(f"expected {name} as real numbers{f' with {dims} dimensions' if dims else ''}, got {got}.")
     return array
 
 
-def optional_number(contents: Contents, name: str, gaps: Gaps) -> float | None:
+def optional_number(contents: Contents, name: str, reading: Reading) -> float | None:
     """Return one real number, None if it is missing.
 
     Args:
         contents: the file.
         name: name of the number.
-        gaps: arguments of the reader, for messages.
+        reading: arguments of the reader, for messages.
 
     Raises:
         StorageError: for anything else.
     """
-    array = real_in(contents, name, gaps)
+    array = real_in(contents, name, reading)
     if array is not None and array.size != 1:
-        raise gaps.error(f"expected one number as {name}, got {array.shape}.")
+        raise reading.error(f"expected one number as {name}, got {array.shape}.")
     return None if array is None else float(array.reshape(-1)[0])
 
 
-def before(points: NDArray[Any], normals: Any) -> NDArray[Any]:
+def _before(points: NDArray[Any], normals: Any) -> NDArray[Any]:
     """Return a place a diagonal, or a metre, before the middle of points, on the side of their normals.
 
     Args:
@@ -245,21 +244,6 @@ def before(points: NDArray[Any], normals: Any) -> NDArray[Any]:
     return place
 
 
-def assumed_in(capture: Capture, name: str, value: Any) -> bool:
-    """Return True if a capture's metadata say that a value was assumed, and it still is the same.
-
-    Args:
-        capture: capture, whose metadata may be anything.
-        name: argument of :func:`read_capture`.
-        value: value in the capture.
-    """
-    said = capture.metadata.get("assumed")
-    if not isinstance(said, Mapping) or name not in said:
-        return False
-    then, now = real_array(said[name]), real_array(value)
-    return np.array_equal(then, now) if then is not None and now is not None else bool(said[name] == value)
-
-
 def same_points(a: NDArray[Any], b: NDArray[Any]) -> bool:
     """Return True for points that are equal up to the rounding of single precision.
 
@@ -269,36 +253,6 @@ def same_points(a: NDArray[Any], b: NDArray[Any]) -> bool:
     """
     with np.errstate(all="ignore"):  # damaged files
         return a.shape == b.shape and bool((np.abs(a - b) <= _ROUNDING * np.abs(a).max()).all())
-
-
-def hidden_volume(capture: Capture, sizes: Mapping[str, int]) -> dict[str, NDArray[np.float64]]:
-    """Return numbers about the hidden volume from the metadata of a capture.
-
-    Args:
-        capture: capture, whose metadata may be anything.
-        sizes: numbers of values by name.
-
-    Returns:
-        Arrays by name, NaN for values that are missing or of another size.
-    """
-    said = capture.metadata.get("hidden_volume")
-    found = {}
-    for name, size in sizes.items():
-        array = real_array(said.get(name)) if isinstance(said, Mapping) else None
-        found[name] = np.full(size, np.nan) if array is None or array.size != size else array.reshape(-1)
-    return found
-
-
-def hidden_side(scan: Scan) -> NDArray[np.float64]:
-    """Return the direction (3,) from the wall to its hidden side: the mean normal, or that to the sensor without
-    normals.
-
-    Args:
-        scan: scan of a capture.
-    """
-    towards = scan.sensor_origin - scan.sensor_points if scan.sensor_normals is None else scan.sensor_normals
-    mean: NDArray[np.float64] = towards.detach().cpu().reshape(-1, 3).mean(0).numpy()
-    return mean
 
 
 def tensor_of(array: NDArray[Any]) -> Tensor:
@@ -338,20 +292,24 @@ def zone_grid(zones: int) -> tuple[int, ...]:
 
 
 def flat_scan(
-    kind: str, points: NDArray[np.float64], gaps: Gaps, spot: Any = None, origin: NDArray[np.float64] | None = None
+    kind: str,
+    points: NDArray[np.float64],
+    reading: Reading,
+    spot: Any = None,
+    origin: NDArray[np.float64] | None = None,
 ) -> Scan:
     """Return a scan on the plane z = 0 whose hidden side is that of +z; lengths count from wall to wall.
 
     Args:
         kind: kind of the scan.
         points: grid or list (..., 3), metres.
-        gaps: arguments of the reader.
+        reading: arguments of the reader.
         spot: laser spot (3,) of a single scan.
         origin: place (3,) of laser and sensor in the file; None takes the arguments, or else assumes one.
     """
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     laser = points if spot is None else np.asarray(spot, np.float64)
-    sensor_origin, laser_origin = (gaps.origin(f"{who}_origin", origin, points, normals, False) for who in _WHO)
+    sensor_origin, laser_origin = (reading.origin(f"{who}_origin", origin, points, normals, False) for who in _WHO)
     laser_normals = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
     return scan_of(kind, points, laser, sensor_origin, laser_origin, normals, laser_normals, legs=False)
 
@@ -372,68 +330,8 @@ def scan_of(kind: str, *arrays: NDArray[Any] | None, legs: bool) -> Scan:
     return Scan(kind, **tensors, first_and_last_leg=legs)
 
 
-def only_transient(capture: Capture, layout: str, legs: bool | None = None) -> Tensor:
-    """Return the transient (T, ...) of a capture of one channel.
-
-    Args:
-        capture: capture with one channel and no batch.
-        layout: name of the layout, for messages.
-        legs: value of ``first_and_last_leg`` that the layout has, None for both.
-
-    Raises:
-        StorageError: for batches, several channels, Stokes components, phasors, truth values, lengths that are counted
-            otherwise.
-    """
-    if capture.transient is None or capture.phasor is not None or capture.polarized:
-        raise cannot(layout, "one transient alone", "phasors or Stokes components")
-    one_channel(capture, capture.transient, layout)
-    if capture.transient.dtype == torch.bool:
-        raise cannot(layout, "numbers", "truth values; write them as numbers, transient.to(torch.uint8)")
-    if legs is not None and capture.scan.first_and_last_leg != legs:
-        words = "with the first and the last leg", "from wall to wall"
-        raise cannot(layout, f"lengths {words[0] if legs else words[1]}", f"lengths {words[1] if legs else words[0]}")
-    tensor: Tensor = capture.transient[0]
-    return tensor
-
-
-def one_channel(capture: Capture, tensor: Tensor, layout: str, before_channel: int = 0) -> None:
-    """Check that a tensor has one channel, no batch, and counts that can be read again.
-
-    Args:
-        capture: capture that the tensor belongs to.
-        tensor: tensor (..., C, T, ...).
-        layout: name of the layout, for messages.
-        before_channel: number of dimensions before C.
-
-    Raises:
-        StorageError: for other tensors.
-    """
-    if tensor.dtype == torch.uint64:
-        tensor_of(array_of(tensor, WHAT))
-    dims = before_channel + 2 + len(capture.scan.shape)
-    if tensor.ndim != dims or tensor.shape[before_channel] != 1:
-        raise cannot(
-            layout, "one channel and no batch",
-            f"{tuple(tensor.shape)}; write each item by itself, and one channel, or their sum",
-        )  # fmt: skip
-
-
-def cannot(layout: str, holds: str, got: str) -> StorageError:
-    """Return the error for a capture that a layout cannot hold.
-
-    Args:
-        layout: name of the layout.
-        holds: captures that it holds.
-        got: the capture, in words.
-    """
-    return StorageError(
-        f"{WHAT}: the layout {layout!r} holds {holds}, got {got}. The library's own format holds all of a capture: "
-        "format='torchtransient'."
-    )
-
-
 def time_axis(
-    gaps: Gaps,
+    reading: Reading,
     start_opl: float | None,
     bin_width_opl: float | None,
     bins: int,
@@ -443,25 +341,25 @@ def time_axis(
     """Return the axis of a file, whose start and width are asked for or assumed where it leaves them open.
 
     Args:
-        gaps: arguments of the reader.
+        reading: arguments of the reader.
         start_opl: start of the first bin, metres of optical path, or None.
         bin_width_opl: width of a bin, metres of optical path, or None.
         bins: number of bins.
         default_s: width that is assumed, seconds.
         start_bins: start that is assumed, in bins.
     """
-    found = gaps.width(bin_width_opl, default_s)
-    return TimeAxis(gaps.start(start_opl, opl_to_seconds(start_bins * found)), found, bins)
+    found = reading.width(bin_width_opl, default_s)
+    return TimeAxis(reading.start(start_opl, opl_to_seconds(start_bins * found)), found, bins)
 
 
-def frequency_axis(gaps: Gaps, stored: FrequencyAxis | None) -> FrequencyAxis:
+def frequency_axis(reading: Reading, stored: FrequencyAxis | None) -> FrequencyAxis:
     """Return the frequencies of a file, or the given ones.
 
     Args:
-        gaps: arguments of the reader.
+        reading: arguments of the reader.
         stored: frequencies of the file, or None.
     """
-    found = gaps.fill("frequencies", stored)
+    found = reading.fill("frequencies", stored)
     if not isinstance(found, FrequencyAxis):
-        raise gaps.error(f"expected frequencies as a FrequencyAxis, got {shown(found)}.")
+        raise reading.error(f"expected frequencies as a FrequencyAxis, got {shown(found)}.")
     return found
