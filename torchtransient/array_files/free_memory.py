@@ -1,4 +1,4 @@
-"""Memory of this machine that can still be taken."""
+"""Memory of this machine that can still be taken, and sizes in words."""
 
 from __future__ import annotations
 
@@ -11,6 +11,18 @@ def available_memory() -> int | None:
     """
     limits = [limit for limit in (_meminfo_available(), _cgroup_available()) if limit is not None]
     return min(limits) if limits else None
+
+
+def size_in_words(count: float) -> str:
+    """Return bytes in words, "1.5 GiB".
+
+    Args:
+        count: number of bytes.
+    """
+    for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
+        if count >= scale:
+            return f"{count / scale:.4g} {unit}"
+    return f"{count / 2**10:.4g} KiB"
 
 
 def _meminfo_available() -> int | None:

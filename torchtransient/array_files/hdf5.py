@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.array_files.free_memory import available_memory
+from torchtransient.array_files.free_memory import available_memory, size_in_words
 from torchtransient.errors import MissingPackageError, StorageError
 
 # Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
@@ -180,8 +180,8 @@ def check_memory(declared: int, what: str) -> None:
     available = available_memory()
     if available is not None and declared > available:
         raise StorageError(
-            f"{what} takes {declared / 1e9:.3g} GB, and {available / 1e9:.3g} GB of memory are left. Free some memory, "
-            "or cut the file into parts with h5py."
+            f"{what} takes {size_in_words(declared)}, and {size_in_words(available)} of memory are left. Free some "
+            "memory, or cut the file into parts with h5py."
         )
 
 

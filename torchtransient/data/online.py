@@ -24,6 +24,7 @@ import torch
 import torch.multiprocessing  # lets connections carry shared tensors
 from torch.utils.data import IterableDataset
 
+from torchtransient.array_files.free_memory import size_in_words
 from torchtransient.checks import MOST, a_recipe, as_number, count, shown
 from torchtransient.data.online_worker import Layout, empty_ring, layout_text, produce
 from torchtransient.data.processes import WorkerError, registered_plugins, spawned
@@ -520,7 +521,7 @@ def _check_memory(layout: Layout, capacity: int) -> None:
     free = shutil.disk_usage(_SHARED).free
     if needed > free:
         raise StorageError(
-            f"{WHAT}: {capacity} samples of {needed / capacity / 2**20:.3g} MiB need {needed / 2**30:.3g} GiB of "
-            f"shared memory, {_SHARED} has {free / 2**30:.3g} GiB. Use a smaller capacity "
+            f"{WHAT}: {capacity} samples of {size_in_words(needed / capacity)} need {size_in_words(needed)} of "
+            f"shared memory, {_SHARED} has {size_in_words(free)}. Use a smaller capacity "
             f"({int(free * 0.8 * capacity // needed)}), or give it more (of a container: --shm-size)."
         )

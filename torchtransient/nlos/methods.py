@@ -10,10 +10,10 @@ from typing import Any
 
 import torch
 
+from torchtransient.array_files.free_memory import size_in_words
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import count, shown, with_article
 from torchtransient.errors import ArgumentError, ShapeError, StorageError
-from torchtransient.nlos.simulation import size_in_words
 from torchtransient.reconstruction import VoxelGrid
 from torchtransient.reconstruction.capture_checks import checked_capture
 from torchtransient.reconstruction.voxels import PlanarScan

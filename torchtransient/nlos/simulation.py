@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from torchtransient.array_files.array_file import path_of
+from torchtransient.array_files.free_memory import size_in_words
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import Numbers, count
@@ -353,22 +354,10 @@ def _check_fits(taken: int, shape: tuple[int, ...], work: Work) -> None:
     if available is not None and taken * (1 + share) > available:
         numbers = " x ".join(map(str, shape))
         raise StorageError(
-            f"simulate: the capture would take {size_in_words(int(taken * (1 + share)))} ({numbers} numbers), and "
+            f"simulate: the capture would take {size_in_words(taken * (1 + share))} ({numbers} numbers), and "
             f"{size_in_words(available)} are available. Use fewer bins, sensor points or laser spots, or simulate "
             "parts of the scan (Scan.single, Scan.points)."
         )
-
-
-def size_in_words(count: int) -> str:
-    """Return bytes in words.
-
-    Args:
-        count: number of bytes.
-    """
-    for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
-        if count >= scale:
-            return f"{count / scale:.4g} {unit}"
-    return f"{count / 2**10:.4g} KiB"
 
 
 def _duration_in_words(seconds: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from torchtransient.array_files.free_memory import available_memory
+from torchtransient.array_files.free_memory import available_memory, size_in_words
 from torchtransient.errors import StorageError
 from torchtransient.scene.variant import device_type
 
@@ -53,16 +53,9 @@ def check_fits(
         return
     parts = " x ".join(str(n) for n in cube_shape)
     batch = f", {films} of them for {items} renders" if items > 1 else ""
-    beside = f", with {_human(nodes)} of nodes beside it" if nodes else ""
+    beside = f", with {size_in_words(nodes)} of nodes beside it" if nodes else ""
     raise StorageError(
-        f"the transient cube would take {_human(cube)} (H x W x T x C = {parts} float32{batch}){beside}, "
-        f"{_human(total)} in all, and {_human(available)} are available on this {device_type(variant)}. Use "
-        f"fewer bins, a smaller film or crop, or a smaller batch."
+        f"the transient cube would take {size_in_words(cube)} (H x W x T x C = {parts} float32{batch}){beside}, "
+        f"{size_in_words(total)} in all, and {size_in_words(available)} are available on this {device_type(variant)}. "
+        f"Use fewer bins, a smaller film or crop, or a smaller batch."
     )
-
-
-def _human(size: int) -> str:
-    for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
-        if size >= scale:
-            return f"{size / scale:.2f} {unit}"
-    return f"{size / 2**10:.1f} KiB"
