@@ -19,9 +19,9 @@ from torchtransient.sensing.responses import (
     TailedResponse,
     WithinBin,
     above_floor,
+    counts_before,
     integrated_counts,
     kernel_of,
-    resample_counts,
 )
 from torchtransient.sensing.time_convolution import filter_rows
 
@@ -93,7 +93,7 @@ class MeasuredResponse(Response):
 
     def cdf(self, time_s: Tensor) -> Tensor:
         shares = self._shares()
-        return counts_before(shares, self.bin_width_s, self._start_s(shares), time_s)
+        return counts_before(shares, self.bin_width_s, time_s, self._start_s(shares))
 
     def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
         shares = self._shares()
@@ -142,7 +142,7 @@ class ComposedResponse(Response):
         if (closed := self._closed()) is not None:
             return closed[0].cdf(time_s, closed[1])
         shares, width_s, start_s = self._table()
-        return counts_before(shares, width_s, start_s, time_s)
+        return counts_before(shares, width_s, time_s, start_s)
 
     def survival(self, time_s: Tensor) -> Tensor:
         if len(self.responses) == 1:
@@ -151,7 +151,7 @@ class ComposedResponse(Response):
             return closed[0].survival(time_s, closed[1])
         shares, width_s, start_s = self._table()
         # seen from its end, the response runs the other way
-        return counts_before(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
+        return counts_before(shares.flip(0), width_s, -time_s, -(start_s + shares.numel() * width_s))
 
     def _table(self) -> tuple[Tensor, float, float]:
         """Return shares (K,) in bins of a width that suits the response, the width, and the start of the first."""
@@ -188,21 +188,6 @@ class ComposedResponse(Response):
         tops = [_gathered(total, first + place - coarse * fine, fine, len(total) // fine + 3) for place in places]
         shares = torch.stack(tops).mean(0)
         return coarse, shares / shares.sum()
-
-
-def counts_before(counts: Tensor, bin_width_s: float, start_s: float | Tensor, time_s: Tensor) -> Tensor:
-    """Sum of a histogram before each time, even within its bins.
-
-    Args:
-        counts: (T,).
-        bin_width_s: width of the bins.
-        start_s: start of the first bin in seconds.
-        time_s: times in seconds, of any shape, which the result has.
-    """
-    # from before the first bin to each time, as one running sum
-    start = torch.as_tensor(start_s - bin_width_s, dtype=torch.float64, device=time_s.device)
-    edges = torch.cat([start.reshape(1), time_s.reshape(-1)])
-    return resample_counts(counts, bin_width_s, edges, start_s=start_s).cumsum(0).reshape(time_s.shape)
 
 
 def _gathered(fine_shares: Tensor, before: int, fine: int, bins: int) -> Tensor:

@@ -152,6 +152,27 @@ def integrated_counts(counts: Tensor, width_s: float, time_s: Tensor, start_s: f
     return width_s * (area[k] + part * (before[k] + 0.5 * part * values[k]) + beyond)
 
 
+def counts_before(counts: Tensor, width_s: float, time_s: Tensor, start_s: float | Tensor = 0.0) -> Tensor:
+    """Sum the counts that lie before each time, spread evenly over each bin.
+
+    Differentiable in the counts, the times and the start.
+
+    Args:
+        counts: (T,).
+        width_s: bin width in seconds.
+        time_s: times in seconds, any shape.
+        start_s: start of the first bin in seconds.
+
+    Returns:
+        Shape of `time_s`, float64.
+    """
+    cumulative = torch.nn.functional.pad(counts.to(torch.float64).cumsum(0), (1, 0))
+    bins = counts.shape[0]
+    position = ((time_s.to(torch.float64) - start_s) / width_s).clamp(0, bins)
+    below = position.floor().clamp_max(bins - 1).long()
+    return cumulative[below] + (position - below) * (cumulative[below + 1] - cumulative[below])
+
+
 def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s: float | Tensor = 0.0) -> Tensor:
     """Resample a histogram to new bins by integrating: sums are conserved.
 
@@ -176,12 +197,7 @@ def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s:
     if counts.ndim != 1 or edges_s.ndim != 1 or not counts.numel():
         raise ShapeError(f"{me}: expected counts (T,) of one bin or more and edges_s (K + 1,), got "
                          f"{tuple(counts.shape)} and {tuple(edges_s.shape)}.")  # fmt: skip
-    cumulative = torch.nn.functional.pad(counts.to(torch.float64).cumsum(0), (1, 0))
-    bins = counts.shape[0]
-    position = ((edges_s.to(torch.float64) - start_s) / width_s).clamp(0, bins)
-    below = position.floor().clamp_max(bins - 1).long()
-    value = cumulative[below] + (position - below) * (cumulative[below + 1] - cumulative[below])
-    return value.diff()
+    return counts_before(counts, width_s, edges_s, start_s).diff()
 
 
 def above_floor(counts: Tensor, floor: float | bool, where: str) -> Tensor:
