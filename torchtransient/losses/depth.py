@@ -12,6 +12,23 @@ from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import DEPTH, DepthMap, reads
 
 
+def on_surfaces(
+    input: object, target: object, mask: Tensor | None, where: str, *, above_zero: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return two depth maps of one shape, and the mask of pixels that count: where the target has a surface.
+
+    Args:
+        input, target: dense real tensors, see `check_pair`.
+        mask: pixels that may count, None for all, see `check_mask`.
+        where: begins the message.
+        above_zero: a target of zero or below is no surface.
+    """
+    ours, theirs = check_pair(input, target, where)
+    surface = torch.isfinite(theirs) & (theirs > 0) if above_zero else torch.isfinite(theirs)
+    given = check_mask(mask, theirs, where)
+    return ours, theirs, surface if given is None else given & surface
+
+
 @reads(input=DEPTH, target=DEPTH)
 def depth_loss(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
@@ -31,10 +48,7 @@ def depth_loss(
         ShapeError: for two shapes.
     """
     where = "depth_loss"
-    input, target = check_pair(input, target, where)
-    surface = torch.isfinite(target)
-    given = check_mask(mask, target, where)
-    mask = surface if given is None else given & surface
+    input, target, mask = on_surfaces(input, target, mask, where)
     return reduce((counted(input, mask) - counted(target, mask)).abs(), reduction, where, mask)
 
 
@@ -79,13 +93,10 @@ def scale_invariant_depth_loss(
     share = check_number("balance", balance, where)
     if not 0 <= share <= 1:
         raise UnitError(f"{where}: expected balance between 0 and 1, got {shown(balance)}.")
-    input, target = check_pair(input, target, where)
+    input, target, mask = on_surfaces(input, target, mask, where, above_zero=True)
     if input.ndim < 2:
         raise ShapeError(f"{where}: expected depth maps (..., Y, X), got {tuple(input.shape)}.")
     least = check_level("floor", floor, input.new_empty(()), where)
-    surface = torch.isfinite(target) & (target > 0)
-    given = check_mask(mask, target, where)
-    mask = surface if given is None else given & surface
     d = _log(counted(input, mask, 1.0), least) - _log(counted(target, mask, 1.0), least)
     number = mask.sum((-2, -1)).clamp_min(1)
     mean = d.sum((-2, -1)) / number

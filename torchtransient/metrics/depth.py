@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchtransient.checks import positive
 from torchtransient.errors import UnitError
-from torchtransient.losses.checks import check_mask, check_number, check_pair, counted
+from torchtransient.losses.checks import check_number, counted
+from torchtransient.losses.depth import on_surfaces
 from torchtransient.losses.results import DEPTH, DepthMap, reads
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite
 
@@ -19,13 +20,10 @@ _MAP = 2
 
 
 def _compared(
-    input: object, target: object, mask: Tensor | None, where: str, *, positive_only: bool = False
+    input: object, target: object, mask: Tensor | None, where: str, *, above_zero: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return estimate and truth, 1 where no pixel counts, and the mask of pixels that count."""
-    ours, theirs = check_pair(input, target, where)
-    surface = torch.isfinite(theirs) & (theirs > 0) if positive_only else torch.isfinite(theirs)
-    given = check_mask(mask, theirs, where)
-    counts = surface if given is None else given & surface
+    ours, theirs, counts = on_surfaces(input, target, mask, where, above_zero=above_zero)
     check_finite(ours, counts, "input", where)
     return counted(ours, counts, 1.0), counted(theirs, counts, 1.0), counts
 
@@ -123,7 +121,7 @@ def depth_abs_rel(
         reduction: "mean" of all pixels, "item" of each map, or "none".
     """
     where = "depth_abs_rel"
-    x, y, counts = _compared(input, target, mask, where, positive_only=True)
+    x, y, counts = _compared(input, target, mask, where, above_zero=True)
     return Tally((x - y).abs() / y, counts, _MAP).result(reduction, where)
 
 
@@ -157,7 +155,7 @@ def depth_delta(
     most = check_number("threshold", threshold, where)
     if most <= 1:
         raise UnitError(f"{where}: expected a threshold above 1, got {threshold!r}.")
-    x, y, counts = _compared(input, target, mask, where, positive_only=True)
+    x, y, counts = _compared(input, target, mask, where, above_zero=True)
     # products, so that small depths cannot overflow a quotient
     within = (x.double() < most * y.double()) & (y.double() < most * x.double())
     return Tally(within.to(x.dtype), counts, _MAP).result(reduction, where)
