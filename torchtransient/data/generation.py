@@ -25,17 +25,16 @@ from torchtransient.data.run_settings import (
     SHARD_FILES,
     Plan,
     RunSettings,
+    as_json,
     bytes_text,
     check_same,
     description,
-    plain,
     read_description,
     samples_per_shard,
     shard_file_name,
     shard_header,
     write_description,
 )
-from torchtransient.data.shard_format import check_compression, check_store
 from torchtransient.data.shards import Shard
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError, level_of_user
 
@@ -260,7 +259,7 @@ def _survey(
                     header, samples = there.header, len(there.index)
             except StorageError as error:
                 fault = str(error)
-        expected = plain(shard_header(settings, described, number))
+        expected = as_json(shard_header(settings, described, number))
         if fault is None:
             fault = _fault_of_header(header, expected, path)
         if fault is not None:

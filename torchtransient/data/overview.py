@@ -197,16 +197,15 @@ def _short(value: Any) -> str:
     return text if len(text) <= _MOST_LETTERS else f"...{text[3 - _MOST_LETTERS :]}"
 
 
-def _last(array: NDArray[Any], dimensions: int) -> NDArray[Any]:
-    """The first of several sensors and Stokes components."""
-    while array.ndim > dimensions:
-        array = array[0]
-    return array
+def _first(array: NDArray[Any], dimensions: int) -> NDArray[Any]:
+    """The first of several sensors and Stokes components: the last dimensions of an array, at 0 of the others."""
+    found: NDArray[Any] = array[(0,) * (array.ndim - dimensions)]
+    return found
 
 
 def _picture(arrays: Mapping[str, NDArray[Any]], behind: int) -> NDArray[Any]:
     if "steady" in arrays and behind == 2:
-        light = _last(arrays["steady"], 3)
+        light = _first(arrays["steady"], 3)
     else:
         name = next((name for name in (*_MEASURED, "measurement") if name in arrays), None)
         if name is None:
@@ -224,8 +223,8 @@ def _picture(arrays: Mapping[str, NDArray[Any]], behind: int) -> NDArray[Any]:
 def _over_time(arrays: Mapping[str, NDArray[Any]], name: str, behind: int) -> NDArray[Any]:
     """Light of the first sensor over time (C, T, ...), or over the film's axis in place of time."""
     if name not in _ROWS:
-        return _last(arrays[name], 2 + behind)
-    total: NDArray[Any] = _last(arrays[name], 3 + behind).sum(1)
+        return _first(arrays[name], 2 + behind)
+    total: NDArray[Any] = _first(arrays[name], 3 + behind).sum(1)
     return total
 
 
@@ -233,20 +232,20 @@ def _label(name: str, array: NDArray[Any]) -> NDArray[Any] | None:
     if name in (*_MEASURED, "steady", "measurement"):
         return None
     if name == "normals":
-        directions: NDArray[Any] = np.clip((np.moveaxis(_last(array, 3), 0, -1) + 1) / 2, 0, 1)
+        directions: NDArray[Any] = np.clip((np.moveaxis(_first(array, 3), 0, -1) + 1) / 2, 0, 1)
         return directions
     if name == "velocity":
-        speeds: NDArray[Any] = np.linalg.norm(_last(array, 3), axis=0)
+        speeds: NDArray[Any] = np.linalg.norm(_first(array, 3), axis=0)
         return speeds
     if name == "albedo":
-        colour = np.moveaxis(_last(array, 3), 0, -1)
+        colour = np.moveaxis(_first(array, 3), 0, -1)
         if colour.shape[-1] != 3:
             colour = np.repeat(colour.mean(-1, keepdims=True), 3, axis=-1)
         shown: NDArray[Any] = np.clip(colour, 0, 1)
         return shown
     if array.ndim < 2 or name in ("position", "uv"):
         return None
-    numbers: NDArray[Any] = _last(array, 2)
+    numbers: NDArray[Any] = _first(array, 2)
     return numbers
 
 

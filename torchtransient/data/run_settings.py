@@ -151,7 +151,7 @@ def description(settings: RunSettings, per_shard: int, about: Any, standard_erro
     Returns:
         Plain data.
     """
-    found: dict[str, Any] = plain(
+    found: dict[str, Any] = as_json(
         {
             "format": FORMAT,
             "key": settings.recipe.key(),
@@ -167,7 +167,7 @@ def description(settings: RunSettings, per_shard: int, about: Any, standard_erro
     return found
 
 
-def plain(value: Any) -> Any:
+def as_json(value: Any) -> Any:
     """Return a value as JSON gives it back.
 
     Args:

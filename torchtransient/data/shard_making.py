@@ -14,7 +14,7 @@ from typing import Any
 
 from torchtransient.data.overview import LatestPicture
 from torchtransient.data.processes import add_plugins, traced
-from torchtransient.data.run_settings import Plan, RunSettings, check_same, plain, shard_file_name, shard_header
+from torchtransient.data.run_settings import Plan, RunSettings, as_json, check_same, shard_file_name, shard_header
 from torchtransient.data.shards import ShardWriter
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, TorchTransientWarning
 from torchtransient.rendering.threads import threads
@@ -94,7 +94,7 @@ class ShardMaker:
                 if not isinstance(found, str):
                     size = sum(array.nbytes for array in found.arrays.values())
                     error = self._standard_error(index, say)
-                    return Measured(size, plain(self._maker.about()), error, tuple(warned))
+                    return Measured(size, as_json(self._maker.about()), error, tuple(warned))
                 reason = found
         raise SceneError(
             f"generate: none of the samples 0 to {indices.stop - 1} of the recipe can be made. The last one: {reason}"
@@ -121,16 +121,14 @@ class ShardMaker:
         """
         settings = self.settings
         if not self._compared:
-            about = plain(self._maker.about())
+            about = as_json(self._maker.about())
             check_same(described["about"], about, Path(settings.folder), tuple(described["about"]))
             self._compared = True
         plan = Plan(settings.n, described["per_shard"])
         indices, failed = plan.indices(shard), 0
         path = Path(settings.folder) / shard_file_name(shard)
         header = shard_header(settings, described, shard)
-        with ShardWriter(
-            path, len(indices), header, store=settings.store, compression=settings.compression
-        ) as writer:
+        with ShardWriter(path, len(indices), header, store=settings.store, compression=settings.compression) as writer:
             others = [index for index in indices if index not in first]
             for index in (*first, *self._maker.order(others)):
                 if index in skip:
