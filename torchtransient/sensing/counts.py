@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import GradientError, UnitError
-from torchtransient.floating import in_single
+from torchtransient.floating import in_single, single
 from torchtransient.sensing.checks import TIME, check_transient, reals
 from torchtransient.sensing.draws import WHOLE_FLOAT32, by_pieces, check_rates, fast_poisson, halve, thin
 from torchtransient.sensing.sensor import RandomSensor, record_score, standard_normal, straight_through
@@ -524,7 +524,7 @@ class MovedCounts(RandomSensor):
     def _drawn(self, x: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None, Tensor]:
         """Items moved, how many of the whole ones went each way, and which are whole; see `look_at_items`."""
         given = check_transient(x, type(self).__name__)
-        counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
+        counts = single(given)
         highest = float(counts.abs().amax()) if counts.numel() else 0.0
         if not math.isfinite(highest):
             raise UnitError(f"{type(self).__name__}: expected finite counts, got NaN or infinity. Look upstream.")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.floating import without_autocast
+from torchtransient.floating import single, without_autocast
 from torchtransient.sensing.checks import check_choice, check_count, check_number, check_transient, reals
 from torchtransient.sensing.parameters import keep_number
 from torchtransient.sensing.responses import FWHM_PER_SIGMA
@@ -44,11 +44,10 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
         raise ShapeError(f"blur_image: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
     from kornia.filters import filter2d
 
-    flat = x.reshape(-1, 1, *x.shape[-2:])
-    work = torch.float32 if x.dtype in (torch.float16, torch.bfloat16) else x.dtype
+    flat = single(x.reshape(-1, 1, *x.shape[-2:]))
     # filter2d correlates; a PSF says where the light of one point goes, so it is turned round
-    kernel = psf.flip(0, 1).unsqueeze(0).to(work)
-    blurred: Tensor = filter2d(flat.to(work), kernel, border_type=border)
+    kernel = psf.flip(0, 1).unsqueeze(0).to(flat.dtype)
+    blurred: Tensor = filter2d(flat, kernel, border_type=border)
     return blurred.reshape(x.shape).to(x.dtype)
 
 

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from torchtransient.axes import fast_length
 from torchtransient.errors import ShapeError
-from torchtransient.floating import without_autocast
+from torchtransient.floating import single, without_autocast
 from torchtransient.sensing.checks import TIME, check_choice, check_transient, reals
 
 Boundary = Literal["zero", "periodic"]
@@ -90,7 +90,7 @@ def window_lags(kernel: Tensor, first: int, bins: int, boundary: Boundary) -> tu
 def _by_shifts(x: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:
     """Sum of shifted images, which keeps the layout."""
     bins, taps = x.shape[TIME], kernel.numel()
-    work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
+    work = single(x)
     if boundary == "periodic":
         work, first, left = work.roll(first, TIME), 0, taps - 1
         padded = torch.cat([work.narrow(TIME, bins - left, left), work], TIME)
@@ -106,9 +106,8 @@ def _by_shifts(x: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Ten
 
 def _direct(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:
     bins, taps = rows.shape[-1], kernel.numel()
-    work = torch.float32 if rows.dtype in (torch.float16, torch.bfloat16) else rows.dtype
-    flat = rows.reshape(-1, 1, bins).to(work)
-    weights = kernel.flip(0).to(work).view(1, 1, -1)
+    flat = single(rows.reshape(-1, 1, bins))
+    weights = kernel.flip(0).to(flat.dtype).view(1, 1, -1)
     if boundary == "periodic":
         # bins `first + taps - 1` before the start, taken from the end of the period
         flat = torch.cat([flat.roll(first, -1)[..., bins - taps + 1 :], flat.roll(first, -1)], -1)
