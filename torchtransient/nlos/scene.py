@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchtransient import scenes
 from torchtransient.array_files.array_file import read_some
 from torchtransient.capture import Scan
 from torchtransient.checks import as_whole, checked_mesh, shown
-from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
+from torchtransient.errors import SceneError, StorageError, UnitError
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import load
 from torchtransient.scene.variant import active_variant
@@ -59,7 +58,7 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
     if not path.is_file():
         raise SceneError(f"{where}: no file {str(path)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
     if suffix == ".npz":
-        return _mesh(*mesh_of_npz(path, where), where)
+        return mesh_shape(*mesh_of_npz(path, where), where)
     return {"type": _PLUGINS[suffix], "filename": str(path), "face_normals": True}
 
 
@@ -81,18 +80,19 @@ def mesh_of_npz(path: Path, where: str) -> tuple[Any, Any]:
     return found["vertices"], found["faces"]
 
 
-def mesh_arrays_shape(vertices: Any, faces: Any, where: str) -> dict[str, Any]:
-    """Call `scenes.triangle_mesh`, with errors that begin with ``where``.
+def mesh_shape(vertices: Any, faces: Any, where: str) -> dict[str, Any]:
+    """Return a mesh of arrays as a shape of a scene dictionary, without a material.
 
     Args:
         vertices: (V, 3), metres.
         faces: (F, 3).
         where: begins the message.
+
+    Raises:
+        ShapeError, UnitError: as `checked_mesh`.
     """
-    try:
-        return scenes.triangle_mesh(vertices, faces)
-    except TorchTransientError as error:
-        raise type(error)(f"{where}: {error}") from error
+    points, triangles = checked_mesh(where, vertices, faces)
+    return {"type": "mesh_arrays", "vertices": points, "faces": triangles}
 
 
 # Names of a capture's own nodes: those of hidden things must be others.
@@ -193,9 +193,9 @@ def shapes_of(hidden: Any) -> dict[str, Any]:
             return shapes
         return {"hidden": dict(hidden)}
     if isinstance(hidden, (tuple, list)) and len(hidden) == 2:
-        return {"hidden": _mesh(hidden[0], hidden[1], "hidden")}
+        return {"hidden": mesh_shape(hidden[0], hidden[1], "hidden")}
     if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
-        return {"hidden": _mesh(hidden.vertices, hidden.faces, "hidden")}
+        return {"hidden": mesh_shape(hidden.vertices, hidden.faces, "hidden")}
     raise SceneError(
         "hidden: expected a Mitsuba shape dictionary, a dictionary of them, (vertices, faces), an object with vertices "
         f"and faces, or a mesh file, got {type(hidden).__name__}."
@@ -254,11 +254,6 @@ def _check_energy(energy: Any) -> None:
     """Raise UnitError for numbers that no laser brings."""
     if not isinstance(energy, Mapping) and not 0 <= energy < _MOST_ENERGY:
         raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {_MOST_ENERGY:g} at most).")
-
-
-def _mesh(vertices: Any, faces: Any, where: str) -> dict[str, Any]:
-    points, triangles = checked_mesh(where, vertices, faces)
-    return {"type": "mesh_arrays", "vertices": points, "faces": triangles}
 
 
 def _range(bounces: Sequence[int] | str) -> tuple[int, int]:

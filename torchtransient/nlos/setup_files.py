@@ -39,9 +39,9 @@ from torchtransient.nlos.scene import (
     DEFAULT_BOUNCES,
     DEFAULT_SEED,
     DEFAULT_SPP,
-    mesh_arrays_shape,
     mesh_file,
     mesh_of_npz,
+    mesh_shape,
 )
 from torchtransient.nlos.tal_yaml import tal_arguments
 from torchtransient.scene.load import load
@@ -122,7 +122,7 @@ def _shape(entry: Mapping[str, Any], kind: str, where: str, folder: Path) -> dic
     if kind == "shape":
         shape: dict[str, Any] = {"type": section.choice("shape", SHAPES)}
     elif kind == "vertices":
-        shape = mesh_arrays_shape(section.get("vertices"), section.get("faces"), where)
+        shape = mesh_shape(section.get("vertices"), section.get("faces"), where)
     else:
         shape = mesh_file(file_beside(section.text("file"), (folder,), where), where)
     place = _place(section)
