@@ -76,7 +76,7 @@ def test_rainbow_is_monotone_in_value_and_equal_in_hue():
 
 def test_symmetric_limit():
     values = np.r_[np.linspace(-1, 1, 201), 1e6]
-    assert colour_maps.symmetric_limit(values, 95) == pytest.approx(0.95, abs=0.02)
+    assert colour_maps.symmetric_limit(values) == pytest.approx(0.99, abs=0.01)
     assert colour_maps.symmetric_limit([0.0, 0.0]) == colour_maps.symmetric_limit([NAN, -INF]) == 1.0
     assert colour_maps.symmetric_limit(np.r_[np.zeros(1000), -3.0]) == 3.0
 

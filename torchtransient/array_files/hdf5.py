@@ -30,6 +30,8 @@ _FILTERS = {1, 2, 3, 4, 5, 6, 32000}
 _FREE_BYTES = 2**20
 # Below, memory is not asked about: files are read in a moment.
 _LARGE_BYTES = 2**26
+# Of an array that is written in parts.
+_PART_BYTES = 2**26
 # Chunks hold a header, and their last ones more than the array.
 _SLACK = 2
 # What HDF5 writes of a text before the type of its letters: of the encoding, of the text, and the letters' version.
@@ -308,18 +310,17 @@ def new_hdf5(path: Path, what: str, **settings: Any) -> Iterator[Any]:
                 raise sink.error
 
 
-def write_parts(dataset: Any, array: NDArray[Any], part_bytes: int = 2**26) -> None:
+def write_parts(dataset: Any, array: NDArray[Any]) -> None:
     """Fill a dataset some first indices at a time, so that an array whose axes were moved is not copied as a whole.
 
     Args:
         dataset: object with ``__setitem__`` by slices of the first axis.
         array: numbers in the dataset's shape.
-        part_bytes: size of a part.
     """
     if array.ndim == 0 or array.size == 0:
         dataset[...] = array
         return
-    step = max(1, part_bytes * len(array) // max(1, array.nbytes))
+    step = max(1, _PART_BYTES * len(array) // max(1, array.nbytes))
     for first in range(0, len(array), step):
         dataset[first : first + step] = array[first : first + step]
 

@@ -16,9 +16,7 @@ from torchtransient.floating import holds
 from torchtransient.sensing.checks import check_number, is_dual, no_arrays
 
 
-def check_map(
-    value: object, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
-) -> float | Tensor:
+def check_map(value: object, name: str, where: str, *, low: float = 0.0, high: float = math.inf) -> float | Tensor:
     """Return a number in a range as a float, or a map of them as a floating tensor with its gradient.
 
     Args:
@@ -27,7 +25,6 @@ def check_map(
         where: name of the caller, for errors.
         low: least value.
         high: largest value.
-        open_low: exclude `low` itself.
 
     Raises:
         UnitError: outside of the range, and for NaN.
@@ -35,7 +32,7 @@ def check_map(
     """
     value = no_arrays(value)
     if not isinstance(value, Tensor):
-        return check_number(value, name, where, low=low, high=high, open_low=open_low)  # type: ignore[arg-type]
+        return check_number(value, name, where, low=low, high=high)  # type: ignore[arg-type]
     if value.is_complex() or value.dtype == torch.bool:
         raise UnitError(f"{where}: expected {name} as real numbers, got {value.dtype}.")
     if value.ndim == 1:
@@ -45,12 +42,11 @@ def check_map(
         )
     numbers = value if value.is_floating_point() else value.double()
     plain = numbers.detach()
-    inside = (plain > low if open_low else plain >= low) & (plain <= high) & torch.isfinite(plain)
+    inside = (plain >= low) & (plain <= high) & torch.isfinite(plain)
     if not holds(inside):
-        left = "(" if open_low else "["
-        unit = unit_of(name)
         raise UnitError(
-            f"{where}: expected every {name} in {left}{low:g}, {high:g}]{unit}, got {plain.min():g} to {plain.max():g}."
+            f"{where}: expected every {name} in [{low:g}, {high:g}]{unit_of(name)}, got {plain.min():g} to "
+            f"{plain.max():g}."
         )
     return numbers
 

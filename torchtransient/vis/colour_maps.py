@@ -93,19 +93,18 @@ def cyclic_map(kind: str = "even") -> ListedColormap:
     return ListedColormap(colours.tolist(), name=f"cyclic, {kind}")
 
 
-def symmetric_limit(values: Any, percentile: float = 99.0) -> float:
+def symmetric_limit(values: Any) -> float:
     """Return half the width of a scale centred at zero.
 
     Args:
         values: numbers of any shape; those that are not finite are left out.
-        percentile: percentile of their sizes.
 
     Returns:
-        The percentile; the maximum where that is zero, 1 where all are.
+        The size that 99 % of them are below; the maximum where that is zero, 1 where all are.
     """
     size = np.abs(np.asarray(values, dtype=np.float64)).ravel()
     size = size[np.isfinite(size)]
     if not size.size or size.max() == 0:
         return 1.0
-    limit = float(np.percentile(size, percentile))
+    limit = float(np.percentile(size, 99))
     return limit if limit > 0 and math.isfinite(1 / limit) else float(size.max())

@@ -24,6 +24,7 @@ from torchtransient.array_files.hdf5 import check_memory, check_size, new_hdf5, 
 # Version 7.3 is HDF5 behind a header.
 _HEADER = b"MATLAB 7.3 MAT-file, Platform: torchtransient, HDF5 schema 1.00 ."
 _USER_BLOCK = 512
+_WHAT = "capture file"
 _CLASSES = {"float64": "double", "float32": "single", "bool": "logical"}
 
 HEADER_BYTES = 128
@@ -211,19 +212,18 @@ def _numbers(elements: _Elements, kind: int, shape: tuple[int, ...]) -> NDArray[
 # ---------------------------------------------------------------------------------------------------------- version 7.3
 
 
-def write_mat(target: Path, variables: Mapping[str, Any], what: str = "capture file") -> None:
+def write_mat(target: Path, variables: Mapping[str, Any]) -> None:
     """Write arrays and structures by name, as MATLAB 7.3.
 
     Args:
         target: checked path.
         variables: arrays, and mappings of arrays, in the order of HDF5, the reverse of MATLAB's.
-        what: subject of messages.
 
     Raises:
         StorageError: for a full disk.
     """
-    with replacing(target, what) as unfinished:
-        with new_hdf5(unfinished, what, userblock_size=_USER_BLOCK) as file:
+    with replacing(target, _WHAT) as unfinished:
+        with new_hdf5(unfinished, _WHAT, userblock_size=_USER_BLOCK) as file:
             for name, value in variables.items():
                 if isinstance(value, Mapping):
                     group = file.create_group(name)
