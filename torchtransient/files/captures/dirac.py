@@ -10,13 +10,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from torchtransient.array_files.array_file import HDF5, array_of, replacing
 from torchtransient.array_files.hdf5 import new_hdf5, write_parts
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.reading import Reading, numbers_in, scan_of, tensor_of, time_axis
-from torchtransient.files.captures.writing import cannot, hidden_side, only_transient
+from torchtransient.files.captures.writing import cannot, only_transient
+from torchtransient.reconstruction.voxels import hidden_side
 
 NAME = "dirac"
 ENDINGS = HDF5
@@ -96,7 +98,7 @@ def write(target: Path, capture: Capture) -> None:
         or np.any(y != y[:, :1])
     ):
         raise cannot(NAME, "confocal grids along x and y on the wall z = 0", repr(scan))
-    if hidden_side(scan)[2] <= 0:
+    if float(hidden_side(scan, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))[2]) < 0:
         raise cannot(NAME, "scans whose hidden side is that of +z", "one of -z, of which a mirror image would be read")
     assert capture.axis is not None  # a transient has one
     if capture.axis.num_bins < 2:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import array_of
 from torchtransient.capture import Capture
-from torchtransient.errors import StorageError
+from torchtransient.errors import ShapeError
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.matlab import write_mat
 from torchtransient.files.captures.reading import (
@@ -30,7 +30,8 @@ from torchtransient.files.captures.reading import (
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.writing import cannot, hidden_side, only_transient
+from torchtransient.files.captures.writing import cannot, only_transient
+from torchtransient.reconstruction.voxels import PlanarScan, hidden_side
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 NAME = "rect_data"
@@ -121,8 +122,12 @@ def write(target: Path, capture: Capture) -> None:
     assert capture.axis is not None  # a transient has one
     if capture.axis.start_opl != 0:
         raise cannot(NAME, "lengths from 0", f"an axis that starts at {capture.axis.start_opl:g} m")
-    dx, dy = _pitches(points)
-    if np.cross(points[0, -1] - points[0, 0], points[-1, 0] - points[0, 0]) @ hidden_side(scan) <= 0:
+    try:
+        grid = PlanarScan.of(scan.sensor_points, who=NAME)
+    except ShapeError:
+        raise cannot(NAME, "regular grids at right angles", f"{scan!r} of other points") from None
+    dy, dx = grid.pitch
+    if float(hidden_side(scan, grid.normal) @ grid.normal) < 0:
         raise cannot(
             NAME, "grids whose columns, rows and hidden side are x, y and z of a right-handed frame",
             "one of which a mirror image would be read; turn over its rows, in the points and in the transient",
@@ -144,16 +149,3 @@ def write(target: Path, capture: Capture) -> None:
             raise cannot(NAME, "a spot that is a sensor point", f"one {off[y, x]:.3g} m away from the nearest")
         variables |= {"sampling_spacing": dx, "SPAD_index": np.array([[x], [y]], np.float64)}
     write_mat(target, variables)
-
-
-def _pitches(points: NDArray[Any]) -> tuple[float, float]:
-    """Return the distances between columns and between rows of a grid. Raises StorageError for an irregular one."""
-    rows, columns = points.shape[:2]
-    x, y = (points[0, -1] - points[0, 0]) / (columns - 1), (points[-1, 0] - points[0, 0]) / (rows - 1)
-    expected = points[0, 0] + np.arange(rows)[:, None, None] * y + np.arange(columns)[None, :, None] * x
-    dx, dy = float(np.linalg.norm(x)), float(np.linalg.norm(y))
-    off = float(np.linalg.norm(points - expected, axis=-1).max())
-    if off > _OFF_GRID * min(dx, dy) or abs(float(x @ y)) > _OFF_GRID * dx * dy:
-        error: StorageError = cannot(NAME, "regular grids at right angles", f"points up to {off:.3g} m off one")
-        raise error
-    return dx, dy

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.array_files.array_file import array_of
-from torchtransient.capture import Capture, Scan
+from torchtransient.capture import Capture
 from torchtransient.checks import real_array
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.contents import WHAT
@@ -49,18 +49,6 @@ def hidden_volume(capture: Capture, sizes: Mapping[str, int]) -> dict[str, NDArr
         array = real_array(said.get(name)) if isinstance(said, Mapping) else None
         found[name] = np.full(size, np.nan) if array is None or array.size != size else array.reshape(-1)
     return found
-
-
-def hidden_side(scan: Scan) -> NDArray[np.float64]:
-    """Return the direction (3,) from the wall to its hidden side: the mean normal, or that to the sensor without
-    normals.
-
-    Args:
-        scan: scan of a capture.
-    """
-    towards = scan.sensor_origin - scan.sensor_points if scan.sensor_normals is None else scan.sensor_normals
-    mean: NDArray[np.float64] = towards.detach().cpu().reshape(-1, 3).mean(0).numpy()
-    return mean
 
 
 def only_transient(capture: Capture, layout: str, legs: bool | None = None) -> Tensor:
