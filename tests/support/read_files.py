@@ -19,7 +19,7 @@ from support.sealed_files import as_first_version
 from support.stored_samples import sample, write
 from support.text_files import RECIPES, SCENE, SETUPS
 from torchtransient.data.run_settings import read_description
-from torchtransient.data.chunks import COMPRESSIONS
+from torchtransient.data.shard_format import COMPRESSIONS
 from torchtransient.files import content_key, read_result, write_result
 from torchtransient.files.captures.formats import LAYOUTS
 

@@ -20,9 +20,9 @@ from torchtransient.array_files.hdf5 import check_memory
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import shown
-from torchtransient.data.encodings import COUNTED, measured_names
 from torchtransient.data.sample import outside_tensor
 from torchtransient.data.serialization import read_frequencies
+from torchtransient.data.shard_format import COUNTED, measured_names
 from torchtransient.data.transient_dataset import TransientDataset
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 from torchtransient.files.captures import tal

@@ -35,6 +35,7 @@ from torchtransient.data.run_settings import (
     shard_header,
     write_description,
 )
+from torchtransient.data.shard_format import check_compression, check_store
 from torchtransient.data.shards import Shard
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError, level_of_user
 

@@ -26,9 +26,20 @@ from torchtransient.array_files.array_file import check_folder, check_source, da
 from torchtransient.array_files.hdf5 import check_memory, dataset_of, hdf5_package, is_number, new_hdf5, read_dataset
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.checks import count, shown
-from torchtransient.data.chunks import LIBVER, Compressor, check_chunks, check_compression, time_axis
-from torchtransient.data.encodings import STORES, check_store, decoded, encoded, encoding_of, measured_names
 from torchtransient.data.sample import Sample
+from torchtransient.data.shard_format import (
+    ENCODINGS,
+    LIBVER,
+    Compressor,
+    check_chunks,
+    check_compression,
+    check_store,
+    decoded,
+    encoded,
+    encoding_of,
+    measured_names,
+    time_axis,
+)
 from torchtransient.errors import StorageError
 
 FORMAT = "torchtransient shard 1"
@@ -578,7 +589,7 @@ def _check_about(about: Mapping[str, Any], rows: int) -> None:
     """Raise ValueError for an entry that :class:`ShardWriter` does not write."""
     right = isinstance(about["header"], dict) and isinstance(about["arrays"], dict)
     right &= all(isinstance(about[name], str) for name in _TEXTS)
-    right &= all(entry["encoding"] in STORES for entry in about["arrays"].values())
+    right &= all(entry["encoding"] in ENCODINGS for entry in about["arrays"].values())
     right &= isinstance(about["values"], list) and all(isinstance(key, str) for key in about["values"])
     lists = [about["structure"], *about["texts"].values()]
     right &= all(isinstance(one, list) and len(one) == rows for one in lists)

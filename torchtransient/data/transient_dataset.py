@@ -22,7 +22,6 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from torchtransient.array_files.array_file import tensor_in
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import count, path_of, shown
-from torchtransient.data.encodings import measured_names
 from torchtransient.data.manifest import named_shards, shards_of
 from torchtransient.data.sample import (
     Epochs,
@@ -32,6 +31,7 @@ from torchtransient.data.sample import (
     sample_generator,
     sample_number,
 )
+from torchtransient.data.shard_format import measured_names
 from torchtransient.data.shards import Shard, part_of
 from torchtransient.errors import (
     ArgumentError,

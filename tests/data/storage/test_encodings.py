@@ -11,7 +11,7 @@ import pytest
 
 from support.stored_samples import AXIS, sample, write
 from torchtransient.data import Shard, TransientDataset, export_web_dataset
-from torchtransient.data.encodings import counts_of, rounded_mantissa
+from torchtransient.data.shard_format import counts_of, rounded_mantissa
 from torchtransient.errors import StorageError
 
 

@@ -24,7 +24,7 @@ import pytest
 from support.marks import long_pairs
 from support.stored_samples import cube, header, sample, write
 from torchtransient.data import Shard, ShardWriter, verify
-from torchtransient.data.chunks import chunk_shape
+from torchtransient.data.shard_format import chunk_shape
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 
 
