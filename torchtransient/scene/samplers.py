@@ -1,4 +1,4 @@
-"""Which sampler draws for a sensor: the one that its scene names, or another one in its place."""
+"""Samplers of sensors: those that scenes name, or others in their place."""
 
 from __future__ import annotations
 

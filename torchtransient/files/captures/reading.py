@@ -1,5 +1,5 @@
-"""What readers of layouts have in common: values that a file leaves open, filled by arguments or by assumptions that
-the capture's metadata name; checked numbers of a file; axes and scans made of them.
+"""Helpers of the readers of layouts: values that a file leaves open, filled by arguments or by assumptions that the
+capture's metadata name; checked numbers of a file; axes and scans made of them.
 """
 
 from __future__ import annotations

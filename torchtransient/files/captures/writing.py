@@ -1,4 +1,4 @@
-"""What writers of layouts have in common: captures that a layout can hold, and what was read or assumed before."""
+"""Helpers of the writers of layouts: captures that a layout can hold, and what was read or assumed before."""
 
 from __future__ import annotations
 
