@@ -40,6 +40,7 @@ from torchtransient.sensing.dead_time.clocked import (
     subdivision_levels,
 )
 from torchtransient.sensing.dead_time.free_running import DARK, detections_per_period, rows_by_contrast
+from torchtransient.sensing.dead_time.once import once
 from torchtransient.sensing.dead_time.renewal import (
     BinResponse,
     ConstantLight,
@@ -254,7 +255,8 @@ class FreeRunningTrain:
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         loss = rate + lost
         kept = rate / loss
-        lines: Tensor = _Trapped.apply(loss, kept * back, source.flatten(1), self.part, self.whole)  # type: ignore[no-untyped-call]
+        given = (once(x) for x in (loss, kept * back, source.flatten(1), self.part))
+        lines: Tensor = _Trapped.apply(*given, self.whole)  # type: ignore[no-untyped-call]
         lines = lines.view_as(source)
         return lines[:, 0] / loss, lines * kept.unsqueeze(1)
 

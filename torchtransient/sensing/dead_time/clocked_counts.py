@@ -30,6 +30,7 @@ from torchtransient.sensing.dead_time.clocked import (
     mean_detections,
     rows_by_subdivision,
 )
+from torchtransient.sensing.dead_time.once import once
 from torchtransient.sensing.dead_time.renewal import (
     ROOT3,
     bin_response,
@@ -610,6 +611,7 @@ def coates_of_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Ten
         raise UnitError(
             f"coates: expected a dead time of at least one bin, got {dead_bins:g} bins. Use narrower bins to undo it."
         )
+    counts = once(counts)
     here, share, rate = _invert_rows(counts, cycles, dead_bins)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
     last = torch.zeros_like(rate)
