@@ -289,3 +289,14 @@ def test_hardly_any_afterpulses_in_bright_light():
     afterpulsing = sensing.Afterpulsing(1e-9, 30e-10, 20.3e-10, bin_width_s=1e-10)
     found = sensing.AfterpulsingSPAD(alone, afterpulsing).expected(rate)
     torch.testing.assert_close(found, alone.expected(rate), rtol=0, atol=1e-7)
+
+
+def test_dark_pixels_have_the_slope_of_dim_ones():
+    """The first photons of a free-running detector have afterpulses, too."""
+    law = sensing.Afterpulsing(0.2, 90e-12, 70e-12, bin_width_s=20e-12)
+    spad = sensing.AfterpulsingSPAD(sensing.FreeRunningSPAD(500, 70e-12, bin_width_s=20e-12), law)
+    dark, dim = (
+        torch.autograd.functional.jacobian(spad.expected, torch.full((1, 8, 1, 1), level, dtype=torch.float64))
+        for level in (0.0, 1e-7)
+    )
+    torch.testing.assert_close(dark, dim, rtol=1e-4, atol=1e-3)

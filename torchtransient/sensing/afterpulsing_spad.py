@@ -65,6 +65,7 @@ _LARGEST_RESIDUAL = 1e-7  # of carriers on a ring, above which it is an error
 _ROWS_AT_ONCE = 128  # bounds the memory of the Krylov vectors
 _LEFT_INDEPENDENT = 1e-8  # of all counts, where generations of independent releases end
 _FEW = 1e-5  # carriers of a detection, whose time inside a bin does not show
+_DIM = 1e-8  # photons of a bin
 _STEP, _MOST_STEPS = 1.2, 3  # mean delays that a part of a bin is wide, at most, and the logarithm of their number
 _Detector = SynchronousSPAD | FreeRunningSPAD
 # transfer functions of a period, and of two windows for what is to be left out, of the same cycle; period in bins
@@ -409,7 +410,7 @@ def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tens
         (P, steps T) per period and part of a bin.
     """
     dark = rate.sum(-1, keepdim=True) < DARK
-    safe = torch.where(dark, 0.1, rate)
+    safe = torch.where(dark, rate + _DIM, rate)  # where carriers are proportional to photons, with the slope of none
     found = rate.new_zeros(rate.shape[0], steps * rate.shape[-1])
     for rows, cut in rows_by_contrast(safe):
         pieces = max(cut, steps)
@@ -418,7 +419,7 @@ def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tens
         hazard, waited = carrier_hazard(train, None, fine, None, seen, tau * pieces, dead_bins * pieces)
         own = _merge_pieces(hazard, waited, pieces // steps)
         found = own if rows is None else found.index_copy(0, rows, own)
-    return torch.where(dark, 0.0, found)
+    return torch.where(dark, found - found.detach(), found)
 
 
 # --------------------------------------------------------------------------------------------------------- the detector
