@@ -66,6 +66,7 @@ _ROWS_AT_ONCE = 128  # bounds the memory of the Krylov vectors
 _LEFT_INDEPENDENT = 1e-8  # of all counts, where generations of independent releases end
 _FEW = 1e-5  # carriers of a detection, whose time inside a bin does not show
 _DIM = 1e-8  # photons of a bin
+_NONE = 1e-8  # of the time armed in the piece where it is longest: what is left of less, in a flood, is rounding
 _STEP, _MOST_STEPS = 1.2, 3  # mean delays that a part of a bin is wide, at most, and the logarithm of their number
 _Detector = SynchronousSPAD | FreeRunningSPAD
 # transfer functions of a period, and of two windows for what is to be left out, of the same cycle; period in bins
@@ -263,8 +264,8 @@ class FreeRunningTrain:
 
 
 def _safe_ratio(part: Tensor, whole: Tensor) -> Tensor:
-    """part / whole, at least 0, and 0 where whole is 0."""
-    some = whole > 1e-200
+    """part / whole, at least 0, and 0 where whole is none beside its row: rounding has no slope."""
+    some = whole > _NONE * whole.detach().amax(-1, keepdim=True)
     return torch.where(some, part / torch.where(some, whole, torch.ones_like(whole)), 0.0).clamp_min(0)
 
 
