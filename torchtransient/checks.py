@@ -217,7 +217,7 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
     try:
         if _has_no_number(values):
             return None
-        plain = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
+        plain = _array(values.detach().cpu()) if hasattr(values, "detach") else np.asarray(values)
         if plain.dtype.kind in "iuf":
             return plain.astype(np.float64)
         # Lists of tensors or of whole numbers beyond 64 bits.
@@ -225,6 +225,13 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
         return np.asarray(plain.tolist(), dtype=np.float64) if listed else None
     except (TypeError, ValueError, OverflowError, RuntimeError):
         return None
+
+
+def _array(tensor: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(tensor)
+    except RuntimeError:  # inside of torch.func, where tensors have no memory
+        return np.asarray(tensor.tolist())
 
 
 def numbers(name: str, values: Any) -> NDArray[np.float64]:

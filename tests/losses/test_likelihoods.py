@@ -181,6 +181,20 @@ counted = pytest.mark.parametrize("case", COUNTED, ids=str)
 
 
 @counted
+def test_counts_have_gradients(case):
+    """Of a sensor that is learnt, say. Bins without counts have one too, and counts take cycles from later bins."""
+    x, y = case.tensors()
+    x, y = x.clone().requires_grad_(), y.clone().requires_grad_()
+    assert bool((y == 0).any())
+    (found,) = torch.autograd.grad(case(x, y, reduction="sum"), y)
+    step = 1e-6 * torch.rand(y.shape, generator=seeded(), dtype=torch.float64)
+    with torch.no_grad():
+        wanted = (4 * case(x, y + step, reduction="sum") - case(x, y + 2 * step, reduction="sum")
+                  - 3 * case(x, y, reduction="sum")) / 2  # fmt: skip
+    assert float((found * step).sum()) == pytest.approx(float(wanted), rel=1e-4)
+
+
+@counted
 def test_counts_below_zero_enter_the_same_formula(case):
     """Poisson, first photons and free-running detectors are linear in the counts, so the mean over +n and -n is that of
     none; read noise is a normal distribution anyway. Under masks, too. The constant has no such formula.

@@ -51,6 +51,14 @@ def test_derivatives_of_depth():
     assert torch.autograd.gradcheck(lambda v: depth_map(v, UNEVEN).depth, volume)
 
 
+def test_depths_as_a_tensor_inside_of_torch_func():
+    volume, planes = torch.rand(4, 2, 3, generator=torch.Generator().manual_seed(0)), torch.tensor([0.1, 0.2, 0.4, 0.5])
+    leaf = volume.clone().requires_grad_()
+    (wanted,) = torch.autograd.grad(depth_map(leaf, planes).depth.sum(), leaf)
+    found = torch.func.grad(lambda v: depth_map(v, planes).depth.sum())(volume)
+    torch.testing.assert_close(found, wanted)
+
+
 def test_gradients_of_empty_volumes_are_finite():
     grid = grid_of(UNEVEN, 3)
     volume = torch.zeros(2, *grid.shape, requires_grad=True)

@@ -289,3 +289,27 @@ def test_hardly_any_afterpulses_in_bright_light():
     afterpulsing = sensing.Afterpulsing(1e-9, 30e-10, 20.3e-10, bin_width_s=1e-10)
     found = sensing.AfterpulsingSPAD(alone, afterpulsing).expected(rate)
     torch.testing.assert_close(found, alone.expected(rate), rtol=0, atol=1e-7)
+
+
+def test_dark_pixels_have_the_slope_of_dim_ones():
+    """The first photons of a free-running detector have afterpulses, too."""
+    law = sensing.Afterpulsing(0.2, 90e-12, 70e-12, bin_width_s=20e-12)
+    spad = sensing.AfterpulsingSPAD(sensing.FreeRunningSPAD(500, 70e-12, bin_width_s=20e-12), law)
+    dark, dim = (
+        torch.autograd.functional.jacobian(spad.expected, torch.full((1, 8, 1, 1), level, dtype=torch.float64))
+        for level in (0.0, 1e-7)
+    )
+    torch.testing.assert_close(dark, dim, rtol=1e-4, atol=1e-3)
+
+
+def test_gradients_in_a_flood():
+    """Bins in which next to no detector is armed any more, behind others without light."""
+    light = [0.0, 8.3, 17.4, 30.6, 0.0, 0.0, 14.7, 0.0, 4.5, 6.7, 0.0, 2.2]
+    x = torch.tensor(light, dtype=torch.float64).view(1, -1, 1, 1).requires_grad_()
+    law = sensing.Afterpulsing([0.03, 0.02], [90e-12, 700e-12], 70e-12, bin_width_s=20e-12)
+    spad = sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(500, dead_time_s=70e-12, bin_width_s=20e-12), law)
+    (found,) = torch.autograd.grad(spad.expected(x).sum(), x)
+    with torch.no_grad():
+        near, far = (spad.expected(x + step).sum() for step in (1e-6, 2e-6))
+        wanted = (4 * near - far - 3 * spad.expected(x).sum()) / 2e-6
+    assert float(found.sum()) == pytest.approx(float(wanted), rel=1e-4)

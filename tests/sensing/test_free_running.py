@@ -8,7 +8,8 @@ import torch
 
 from support.marks import long_rows
 from support.sensing.event_driven import dense_limit
-from torchtransient.sensing import free_running_rate, nonparalyzable_histogram, paralyzable_histogram
+from torchtransient.errors import GradientError
+from torchtransient.sensing import coates, free_running_rate, nonparalyzable_histogram, paralyzable_histogram
 
 BINS = 64
 
@@ -53,6 +54,26 @@ def test_gradients(solve, dead):
     x = as_image(pulse(2.0, 12)).clone().requires_grad_()
     d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(solve, (x, d), check_forward_ad=True)
+
+
+@pytest.mark.parametrize("dead", [3.0, 3.75])
+def test_gradients_in_bins_without_light(dead):
+    """Light is compared with that of next to none, where no rounding is in the way."""
+    lit = torch.tensor([0.0, 0.11, 0, 0, 0.54, 0, 0.28, 0.16, 0, 0.1, 0.08, 0], dtype=torch.float64).view(1, -1, 1, 1)
+
+    def slopes(x):
+        return torch.autograd.functional.jacobian(lambda rate: nonparalyzable_histogram(rate, dead), x)
+
+    torch.testing.assert_close(slopes(lit), slopes(lit.clamp_min(1e-7)), rtol=1e-5, atol=1e-5)
+
+
+def test_second_derivatives_are_refused():
+    """By `torch.autograd.grad` as well, which leaves nodes of torch's own refusal out."""
+    x = as_image(pulse(2.0, 12)).clone().requires_grad_()
+    for rate in (nonparalyzable_histogram(x, 3.4), coates(30 * x, 100, 2.3).rate):
+        (gradient,) = torch.autograd.grad(rate.square().sum(), x, create_graph=True)
+        with pytest.raises(GradientError, match="second derivatives"):
+            torch.autograd.grad(gradient.sum(), x)
 
 
 def test_dark_and_saturated_pixels():

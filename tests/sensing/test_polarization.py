@@ -112,3 +112,15 @@ def test_physicality():
     mixed = torch.cat([good, bad], dim=-1).requires_grad_()
     assert torch.autograd.gradcheck(sensing.project_physical, mixed)
     assert torch.autograd.gradcheck(sensing.unphysical_part, mixed)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_crossed_analysers_have_their_slope(dtype):
+    """Whatever rounding leaves of light that no part of passes."""
+    angles = torch.arange(0.0, 180, 10, dtype=torch.float64)
+    for angle, row in zip(angles.tolist(), sensing.linear_analyzers(angles.tolist()), strict=True):
+        turn = math.radians(2 * (angle + 90))
+        crossed = torch.tensor([1.0, math.cos(turn), math.sin(turn), 0.0], dtype=dtype).view(4, 1, 1, 1, 1)
+        for camera in (sensing.Analyzers(row[None]), sensing.PolarizationMosaic(row.view(1, 1, 4))):
+            slope = torch.autograd.functional.jacobian(camera.expected, crossed)
+            torch.testing.assert_close(slope.flatten(), row.to(dtype))

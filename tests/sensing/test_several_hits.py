@@ -203,3 +203,13 @@ def test_log_prob_at_the_ends():
     assert impossible[1] == -torch.inf
     sure = sensing.first_photon_log_prob(image([10.0, 0, 0, 0]), image([50.0, 0, 0, 0]), 10, dead_bins=2.0)
     assert abs(float(sure.flatten()[0])) < 1e-12
+
+
+@pytest.mark.parametrize("total", [1.0, 15.0])
+def test_the_derivative_of_coates_is_the_inverse_one(total):
+    rate = total / 10 * (0.5 + torch.rand(1, 10, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))
+    counts = 1000 * sensing.detections_with_dead_time(rate, 2.3)
+    there = torch.autograd.functional.jacobian(lambda r: 1000 * sensing.detections_with_dead_time(r, 2.3), rate)
+    back = torch.autograd.functional.jacobian(lambda n: sensing.coates(n, 1000, 2.3).rate, counts)
+    product = back.reshape(10, 10) @ there.reshape(10, 10)
+    torch.testing.assert_close(product, torch.eye(10, dtype=torch.float64), rtol=0, atol=1e-5)

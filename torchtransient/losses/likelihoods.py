@@ -498,10 +498,11 @@ def divisor(value: Tensor, mask: Tensor | None, reduction: Reduction) -> Tensor 
 def _count_log(counts: Tensor, mean: Tensor, least: Tensor | None) -> Tensor:
     """`counts log(mean)`; 0 without counts; where the mean is below `least`, the tangent of the logarithm there."""
     hit = counts != 0
+    # where on the input: xlogy(0, 0) has a NaN gradient
+    some = hit | (mean >= torch.finfo(mean.dtype).tiny)
     dark = None if least is None else hit & (mean < least)
     if dark is None or least is None or not bool(dark.any()):
-        # where on the input: xlogy(0, 0) has a NaN gradient
-        return torch.where(hit, counts * torch.where(hit, mean, 1.0).log(), 0.0)
+        return torch.where(some, counts * torch.where(some, mean, 1.0).log(), 0.0)
     level = torch.where(dark, least, 1.0)
-    near = torch.where(hit & ~dark, mean, level)
-    return torch.where(hit, counts * (near.log() + torch.where(dark, mean / level - 1, 0.0)), 0.0)
+    near = torch.where(some & ~dark, mean, level)
+    return torch.where(some, counts * (near.log() + torch.where(dark, mean / level - 1, 0.0)), 0.0)

@@ -40,6 +40,7 @@ from torchtransient.sensing.dead_time.clocked import (
     subdivision_levels,
 )
 from torchtransient.sensing.dead_time.free_running import DARK, detections_per_period, rows_by_contrast
+from torchtransient.sensing.dead_time.once import once
 from torchtransient.sensing.dead_time.renewal import (
     BinResponse,
     ConstantLight,
@@ -64,6 +65,8 @@ _LARGEST_RESIDUAL = 1e-7  # of carriers on a ring, above which it is an error
 _ROWS_AT_ONCE = 128  # bounds the memory of the Krylov vectors
 _LEFT_INDEPENDENT = 1e-8  # of all counts, where generations of independent releases end
 _FEW = 1e-5  # carriers of a detection, whose time inside a bin does not show
+_DIM = 1e-8  # photons of a bin
+_NONE = 1e-8  # of the time armed in the piece where it is longest: what is left of less, in a flood, is rounding
 _STEP, _MOST_STEPS = 1.2, 3  # mean delays that a part of a bin is wide, at most, and the logarithm of their number
 _Detector = SynchronousSPAD | FreeRunningSPAD
 # transfer functions of a period, and of two windows for what is to be left out, of the same cycle; period in bins
@@ -254,14 +257,15 @@ class FreeRunningTrain:
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         loss = rate + lost
         kept = rate / loss
-        lines: Tensor = _Trapped.apply(loss, kept * back, source.flatten(1), self.part, self.whole)  # type: ignore[no-untyped-call]
+        given = (once(x) for x in (loss, kept * back, source.flatten(1), self.part))
+        lines: Tensor = _Trapped.apply(*given, self.whole)  # type: ignore[no-untyped-call]
         lines = lines.view_as(source)
         return lines[:, 0] / loss, lines * kept.unsqueeze(1)
 
 
 def _safe_ratio(part: Tensor, whole: Tensor) -> Tensor:
-    """part / whole, at least 0, and 0 where whole is 0."""
-    some = whole > 1e-200
+    """part / whole, at least 0, and 0 where whole is none beside its row: rounding has no slope."""
+    some = whole > _NONE * whole.detach().amax(-1, keepdim=True)
     return torch.where(some, part / torch.where(some, whole, torch.ones_like(whole)), 0.0).clamp_min(0)
 
 
@@ -407,7 +411,7 @@ def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tens
         (P, steps T) per period and part of a bin.
     """
     dark = rate.sum(-1, keepdim=True) < DARK
-    safe = torch.where(dark, 0.1, rate)
+    safe = torch.where(dark, rate + _DIM, rate)  # where carriers are proportional to photons, with the slope of none
     found = rate.new_zeros(rate.shape[0], steps * rate.shape[-1])
     for rows, cut in rows_by_contrast(safe):
         pieces = max(cut, steps)
@@ -416,7 +420,7 @@ def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tens
         hazard, waited = carrier_hazard(train, None, fine, None, seen, tau * pieces, dead_bins * pieces)
         own = _merge_pieces(hazard, waited, pieces // steps)
         found = own if rows is None else found.index_copy(0, rows, own)
-    return torch.where(dark, 0.0, found)
+    return torch.where(dark, found - found.detach(), found)
 
 
 # --------------------------------------------------------------------------------------------------------- the detector

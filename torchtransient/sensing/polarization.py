@@ -347,8 +347,8 @@ class Analyzers(Sensor):
 
 
 def _without_rounding(light: Tensor, s0: Tensor) -> Tensor:
-    """Light behind analysers; what rounding has left below zero is zero."""
-    return torch.where((light < 0) & (light >= -_ROUNDING * s0), 0.0, light)
+    """Light behind analysers; what rounding has left below zero is zero, with its own slope."""
+    return light - torch.where((light < 0) & (light >= -_ROUNDING * s0), light.detach(), 0.0)
 
 
 def _extinction(extinction_ratio: float, where: str) -> float:

@@ -9,7 +9,8 @@ With counts n drawn from a distribution whose mean is m(x), and a loss f:
 - `straight_through`: the value is n, the gradient f'(n) dm/dx. Exact for linear losses only: for f = n^2 and Poisson n
   the gradient is short by dm/dx (that of the variance).
 - `score`: the value is n, the gradient (f(n) - baseline) d log p(n | x)/dx. Unbiased for every loss, continuous or not;
-  high variance, which falls with a baseline.
+  high variance, which falls with a baseline. Where m is exactly 0 no count is ever drawn: what the first one would
+  change is missing.
 
 `score` needs the value of the loss, which no backward pass knows. It is therefore used through a context:
 

@@ -417,19 +417,19 @@ def first_photon_log_prob(
     dead_bins = None if dead_bins is None else one_number(dead_bins, "dead_bins", where)
     n, r = counts.to(torch.float64), rate.to(torch.float64)
     if dead_bins is None:
-        short, exposed = torch.zeros_like(r), number - sum_before(n.detach())
+        short, exposed = torch.zeros_like(r), number - sum_before(n)
     else:
-        time = armed_time(n.detach(), number, float(dead_bins))
+        time = armed_time(n, number, float(dead_bins))
         short, exposed = time.short_exposures(r), time.exposed
     quiet = exposed - n
     # with a dead time the armed cycles are known on average only
     refuse_cut_off(dead_bins, "dead_bins", where)
     check_cycles(quiet, number, -0.5 if dead_bins is None else -0.5 - 6 * number**0.5, where)
     quiet = quiet.clamp_min(0)
-    hit = n != 0
-    # where on the input: the logarithm of 0 has no finite gradient
-    fire = log_of_firing(torch.where(hit, r, 0.5))
-    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - short
+    # where on the input: the logarithm of 0 has no finite gradient, and is of no count
+    some = (n != 0) | (r >= torch.finfo(r.dtype).tiny)
+    fire = log_of_firing(torch.where(some, r, 0.5))
+    value = torch.where(some, n * fire, torch.zeros_like(r)) - r * quiet - short
     if constant:
         value = value + (torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1))
     return value.to(rate.dtype)

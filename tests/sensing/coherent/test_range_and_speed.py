@@ -84,6 +84,19 @@ def test_gradient_follows_the_line():
     assert (to_speed * slope).sum().item() == pytest.approx(0.0, abs=0.01)
 
 
+def test_symmetric_lines_have_a_gradient():
+    chirps = chirps_of()
+    axis = chirps.time_axis((0.5, 4.0), (-1.0, 1.0))
+    beats = torch.zeros(2, axis.num_bins, 1, 1, dtype=torch.float64)
+    beats[:, 7:10] = torch.tensor([0.3, 1.0, 0.3], dtype=torch.float64).view(3, 1, 1)
+    beats.requires_grad_()
+    (found,) = torch.autograd.grad(range_and_speed(beats, chirps, axis)[0].sum(), beats)
+    leaning = beats.detach().clone()
+    leaning[:, 9] += 1e-6
+    step = (range_and_speed(leaning, chirps, axis)[0] - range_and_speed(beats, chirps, axis)[0]) / 1e-6
+    assert found[:, 9].sum().item() == pytest.approx(step.item(), rel=1e-4)
+
+
 def test_nothing_is_nan():
     chirps = chirps_of()
     axis = chirps.time_axis((0.5, 4.0), (-1.0, 1.0))

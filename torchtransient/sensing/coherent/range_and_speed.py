@@ -103,11 +103,12 @@ def _offset(lean: Tensor, chirps: Chirps, axis: TimeAxis, bins: Bins) -> Tensor:
     leans = np.maximum.accumulate((right - left) / (left + here + right))
     knots = torch.from_numpy(leans).to(lean)
     at = torch.from_numpy(offsets).to(lean)
-    amount = lean.abs()
+    side = torch.where(lean < 0, -1.0, 1.0).to(lean)  # a symmetric line has a slope, too
+    amount = lean * side
     upper = torch.searchsorted(knots, amount.detach().contiguous()).clamp(1, _OFFSETS - 1)
     low, high = knots[upper - 1], knots[upper]
     share = ((amount - low) / (high - low).clamp_min(torch.finfo(lean.dtype).tiny)).clamp(0, 1)
-    return torch.sign(lean) * (at[upper - 1] + share * (at[upper] - at[upper - 1]))
+    return side * (at[upper - 1] + share * (at[upper] - at[upper - 1]))
 
 
 @in_single

@@ -30,6 +30,7 @@ from torchtransient.sensing.dead_time.clocked import (
     mean_detections,
     rows_by_subdivision,
 )
+from torchtransient.sensing.dead_time.once import once
 from torchtransient.sensing.dead_time.renewal import (
     ROOT3,
     bin_response,
@@ -610,17 +611,16 @@ def coates_of_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Ten
         raise UnitError(
             f"coates: expected a dead time of at least one bin, got {dead_bins:g} bins. Use narrower bins to undo it."
         )
+    counts = once(counts)
     here, share, rate = _invert_rows(counts, cycles, dead_bins)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
     last = torch.zeros_like(rate)
     for _ in range(_CORRECTIONS):
-        with torch.no_grad():
-            # in a flood the histogram tells little, and the cost of looking closer has no end
-            seen = rate.nan_to_num(0.0).clamp_max(_FLOOD)
-            missed = cycles * (mean_detections(seen.T, dead).T - cycle_means(seen, dead, 1, None).count)
-            missed = missed.clamp(-_LARGEST_CORRECTION * counts, _LARGEST_CORRECTION * counts)
-            settled = not bool(((missed - last).abs() > 1e-10 * counts).any())
-        if settled:
+        # in a flood the histogram tells little, and the cost of looking closer has no end
+        seen = rate.nan_to_num(0.0).clamp_max(_FLOOD)
+        missed = cycles * (mean_detections(seen.T, dead).T - cycle_means(seen, dead, 1, None).count)
+        missed = missed.clamp(-_LARGEST_CORRECTION * counts, _LARGEST_CORRECTION * counts)
+        if not bool(((missed - last).abs() > 1e-10 * counts).any()):
             break
         last = missed
         here, share, rate = _invert_rows(counts - missed, cycles, dead_bins)

@@ -38,8 +38,10 @@ from torchtransient.sensing.dead_time.renewal import (
     sum_of_detections,
 )
 from torchtransient.sensing.draws import sample_multinomial
+from torchtransient.sensing.sensor import straight_through
 
 DARK = 1e-12  # photons per period; below, detections equal photons
+_ROUNDING = 1e-9  # of probabilities and of counts per period: more than solutions are off by
 _BELOW_ZERO = 1e-5  # of the largest bin: counts as far below zero show bins too wide for the light in them
 _SETTLED = 1e-2  # of all counts: change from pieces twice as wide, some ten times the error that is left
 _FINEST = 32  # pieces of a bin
@@ -93,10 +95,17 @@ def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
         if pieces > 1:
             rows = inside if rows is None else inside[rows]
             state = _replace_rows(state, _solve_settled(safe[rows], dead_bins, pieces), rows)
-    detected = torch.where(dark, rate, state.detected.clamp_min(0))
-    late = torch.where(dark, torch.zeros_like(rate), torch.minimum(state.late.clamp_min(0), detected))
-    armed = torch.where(dark, torch.ones_like(rate), state.armed.clamp(0, 1))
+    detected = torch.where(dark, rate, _within(state.detected, None))
+    late = torch.where(dark, torch.zeros_like(rate), _within(state.late, detected))
+    armed = torch.where(dark, torch.ones_like(rate), _within(state.armed, torch.ones_like(rate)))
     return FreeRunningState(detected, armed, late, state.whole)
+
+
+def _within(x: Tensor, high: Tensor | None) -> Tensor:
+    """`x` from zero to `high`, with its slope where it is out by rounding, as in every other bin without light."""
+    near = x.clamp_min(-_ROUNDING)
+    near = near if high is None else torch.minimum(near, high + _ROUNDING)
+    return straight_through(x.clamp(torch.zeros_like(x), high), near)
 
 
 def _armed_in_the_light(rate: Tensor, state: FreeRunningState) -> Tensor:
