@@ -241,15 +241,13 @@ class Batches(Sampler[list[int]]):
         Args:
             step: number of the step.
         """
-        number, part = count(f"{_WHAT}: step", step, 0, UnitError), self.batch_size // self.world_size
-        first = number * self.batch_size + self.rank * part
-        return [self._sample(n) for n in range(first, first + part)]
+        return [self._sample(n) for n in self._draws(step)]
 
     def loader(self, data: Dataset[Any], *, workers: int = 0, renders: bool = False, **options: Any) -> DataLoader[Any]:
         """Make a DataLoader of these batches, which takes nothing from torch's own generator.
 
         An iterator of other loaders draws from it, so that a run that is resumed would have other random numbers than
-        one that was not.
+        one that was not. Data sets of ``tt.data`` with a seed draw maps and noise anew in each pass over the samples.
 
         Args:
             data: map-style data set of ``size`` samples.
@@ -270,7 +268,8 @@ class Batches(Sampler[list[int]]):
         own: dict[str, Any] = {"generator": self._of_workers()}
         if workers and renders:
             own |= {"multiprocessing_context": "spawn", "persistent_workers": True, "worker_init_fn": worker_init}
-        return DataLoader(data, batch_sampler=self, num_workers=workers, **{**own, **options})
+        batches = _WithPasses(self) if getattr(data, "takes_passes", False) else self
+        return DataLoader(data, batch_sampler=batches, num_workers=workers, **{**own, **options})
 
     def epoch(self, step: int) -> float:
         """Return the number of passes over the data set before a step.
@@ -333,6 +332,12 @@ class Batches(Sampler[list[int]]):
     def _order(self) -> dict[str, Any]:
         return {"size": self.size, "batch_size": self.batch_size, "seed": self.seed, "shuffle": self.shuffle}
 
+    def _draws(self, step: int) -> range:
+        """Numbers of this rank's samples at a step, counted over all passes."""
+        number, part = count(f"{_WHAT}: step", step, 0, UnitError), self.batch_size // self.world_size
+        first = number * self.batch_size + self.rank * part
+        return range(first, first + part)
+
     def _sample(self, number: int) -> int:
         epoch, place = divmod(number, self.size)
         if not self.shuffle:
@@ -340,3 +345,15 @@ class Batches(Sampler[list[int]]):
         if self._kept is None or self._kept[0] != epoch:
             self._kept = epoch, np.random.Generator(np.random.Philox([self.seed, epoch])).permutation(self.size)
         return int(self._kept[1][place])
+
+
+class _WithPasses(Sampler[list[tuple[int, int]]]):
+    """Batches of (number, passes over the data set before it)."""
+
+    def __init__(self, batches: Batches) -> None:
+        self.batches = batches
+
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
+        for step, samples in enumerate(self.batches, self.batches.step):
+            passes = [draw // self.batches.size for draw in self.batches._draws(step)]
+            yield list(zip(samples, passes, strict=True))
