@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from datetime import timedelta
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler, Subset
 
 from torchtransient.checks import count, is_one_of, shown
 from torchtransient.errors import DeviceError, StorageError, UnitError
@@ -247,7 +247,8 @@ class Batches(Sampler[list[int]]):
         """Make a DataLoader of these batches, which takes nothing from torch's own generator.
 
         An iterator of other loaders draws from it, so that a run that is resumed would have other random numbers than
-        one that was not. Data sets of ``tt.data`` with a seed draw maps and noise anew in each pass over the samples.
+        one that was not. Data sets of ``tt.data`` with a seed, and a ``Subset`` of one, draw maps and noise anew in
+        each pass over the samples.
 
         Args:
             data: map-style data set of ``size`` samples.
@@ -268,8 +269,14 @@ class Batches(Sampler[list[int]]):
         own: dict[str, Any] = {"generator": self._of_workers()}
         if workers and renders:
             own |= {"multiprocessing_context": "spawn", "persistent_workers": True, "worker_init_fn": worker_init}
-        batches = _WithPasses(self) if getattr(data, "takes_passes", False) else self
-        return DataLoader(data, batch_sampler=batches, num_workers=workers, **{**own, **options})
+        whole: Any = data
+        places: Sequence[int] = range(self.size)
+        while type(whole) is Subset:
+            whole, places = whole.dataset, [whole.indices[place] for place in places]
+        own["batch_sampler"] = self
+        if getattr(whole, "takes_passes", False):
+            data, own["batch_sampler"] = whole, _WithPasses(self, places)
+        return DataLoader(data, num_workers=workers, **{**own, **options})
 
     def epoch(self, step: int) -> float:
         """Return the number of passes over the data set before a step.
@@ -348,12 +355,12 @@ class Batches(Sampler[list[int]]):
 
 
 class _WithPasses(Sampler[list[tuple[int, int]]]):
-    """Batches of (number, passes over the data set before it)."""
+    """Batches of (number in the whole data set, passes over the samples before it)."""
 
-    def __init__(self, batches: Batches) -> None:
-        self.batches = batches
+    def __init__(self, batches: Batches, places: Sequence[int]) -> None:
+        self.batches, self.places = batches, places
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
         for step, samples in enumerate(self.batches, self.batches.step):
             passes = [draw // self.batches.size for draw in self.batches._draws(step)]
-            yield list(zip(samples, passes, strict=True))
+            yield list(zip([self.places[n] for n in samples], passes, strict=True))

@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 import torch
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Subset
 
 import torchtransient as tt
 from support.stored_samples import folder
@@ -84,6 +84,15 @@ def test_batches_draw_maps_and_noise_anew_in_each_pass(data, workers):
             assert torch.equal(found[passes][0], expected["depth"])
             assert torch.equal(found[passes][1], expected["measurement"])
     assert not all(torch.equal(first[0], second[0]) for first, second, *_ in read.values())
+
+
+def test_batches_of_a_part_draw_anew_too(data):
+    noisy = TransientDataset(data, fields=["depth"], transform=torch.poisson, seed=1)
+    part = Subset(Subset(noisy, range(2, N)), [3, 1])
+    batches = tt.training.Batches(2, 2, shuffle=False)
+    for passes, batch in zip(range(2), batches.loader(part), strict=False):
+        expected = [noisy.sample(number, passes)["measurement"] for number in (5, 3)]
+        assert torch.equal(batch["measurement"], torch.stack(expected))
 
 
 def test_samples_of_two_folders_with_one_number(data, tmp_path):
