@@ -53,6 +53,21 @@ def test_files_of_another_kind_say_what_reads_them(scene, capture, tmp_path):
             read(tmp_path / "render.npz")
 
 
+@pytest.mark.parametrize(("format", "name"), [("tal", "wall.hdf5"), ("rect_data", "wall.mat")])
+def test_captures_of_other_programs_lead_to_their_reader(capture, tmp_path, format, name):
+    place = capture.write(tmp_path / name, format=format)
+    for look in (read_result, tt.vis.peak_time_picture, tt.vis.frame_grid, tt.vis.view):
+        with pytest.raises(StorageError, match=r"another program tt\.nlos\.Capture\.read\(path\)\.write"):
+            look(place)
+    assert tt.nlos.Capture.read(place).scan.kind == capture.scan.kind
+
+
+def test_bounds_of_numbers_are_those_of_tensors():
+    sensing, hundred = tt.sensing, torch.tensor(100.0)
+    assert sensing.range_deviation_m(300e-12, 100) == sensing.range_deviation_m(300e-12, hundred)
+    assert sensing.phase_noise_rad(100.0, 200.0, 4) == sensing.phase_noise_rad(hundred, 2 * hundred, 4)
+
+
 def test_a_function_of_torch_in_wrap_is_told_of_arrays():
     for function in (torch.sin, lambda x: x.mean()):
         with pytest.raises((TypeError, AttributeError)) as told:

@@ -118,7 +118,7 @@ def test_gates_become_frames(folder):
 @together("arguments, word", [
     (("video", "missing.h5", "v.gif"), "does not exist"), (("video", "box.h5", "v.avi"), ".mp4 or .gif"),
     (("video", "box.h5", "nowhere/v.gif"), "'nowhere' does not exist"),
-    (("video", "box.xml", "v.gif"), "not a file of arrays"),
+    (("video", "box.xml", "v.gif"), "expected a name that ends in"),
     (("picture", "box.h5", "nowhere/a.png"), "'nowhere' does not exist"),
     (("picture", "box.h5", "a.png", "--kind", "histogram"), "needs --pixel"),
     (("picture", "box.h5", "a.png", "--kind", "rainbow", "--row", "1"), "--row has no effect"),

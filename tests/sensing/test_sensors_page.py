@@ -22,7 +22,7 @@ def run(number):
 
 
 def test_every_example_is_run_here():
-    assert len(SENSORS.programs()) == 4
+    assert len(SENSORS.programs()) == 5
 
 
 def test_first_example():
@@ -45,8 +45,15 @@ def test_example_of_two_taps():
     assert abs(float(error.mean())) < 4 * said / 16
 
 
-def test_example_of_a_coherent_lidar():
+def test_example_of_depth():
     names = run(2)
+    for found, bound in ((names["depth_m"], 1.1), (names["rough_m"], 1.2)):
+        assert float((found - 1.2).square().mean().sqrt()) < bound * sensing.range_deviation_m(300e-12, 200)
+    assert int(names["several"].valid.sum()) == 256
+
+
+def test_example_of_a_coherent_lidar():
+    names = run(3)
     # Half a bin of the light, 9 mm, and some noise; speckle of bins for themselves stays within a line.
     assert names["range_m"].item() == pytest.approx(names["distance"], abs=0.02)
     assert names["speed_m_s"].item() == pytest.approx(names["speed"], abs=0.01)
@@ -56,7 +63,7 @@ def test_example_of_a_coherent_lidar():
 
 
 def test_devices_example():
-    assert run(3)["quiet"].sensor().stages[1].read_noise_e == 5.0
+    assert run(4)["quiet"].sensor().stages[1].read_noise_e == 5.0
 
 
 def test_all_devices_are_listed_and_drawn():

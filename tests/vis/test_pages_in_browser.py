@@ -431,6 +431,7 @@ def test_a_page_fits_the_screen(show):
     for x in (
         cases.front(3, 12, 12), cases.volume(rows=14), cases.capture("exhaustive", size=(8, 8)),
         cases.result(rates=rates[..., : cases.H], rate_axis=rate_axis), cases.slow_phasors(),
+        1e-12 * cases.noise(1, 9, 12, 12),
     ):  # fmt: skip
         shown = show(x)
         shown.page.set_viewport_size({"width": SCREEN["width"], "height": SCREEN["height"] - spare})

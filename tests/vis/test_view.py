@@ -143,6 +143,7 @@ REFUSED = {
     "a word": (lambda: tt.vis.view({"albedo": 1}), ArgumentError, "expected"),
     "a small size": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), max_megabytes=1.9), UnitError, "least 2"),
     "a folder": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), "nowhere/a.html"), StorageError, "nowhere"),
+    "an ending": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), "a.png"), StorageError, r"ends in \.html"),
     "a file": (lambda: tt.vis.view("missing.h5"), StorageError, "missing.h5"),
 }  # fmt: skip
 

@@ -45,6 +45,7 @@ _READERS = {
     "torchtransient capture": "tt.nlos.Capture.read",
     "torchtransient volume": "tt.nlos.read_volume",
 }
+_FOREIGN = " Of a capture of another program tt.nlos.Capture.read(path).write('scan.h5') makes a file of this library."
 _PART_BYTES = 2**26
 # What the readers of NumPy and h5py raise for files that are damaged or something else.
 _DAMAGED = (
@@ -110,20 +111,22 @@ def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callab
     Raises:
         StorageError: for a file that is missing, of another format, or damaged.
     """
-    source = check_source(_path_with_ending(path, what), what)
+    source = check_source(_path_with_ending(path, what, _FOREIGN), what)
     with damage_said(source, what):
         found = _format_of(source, what)
+        if not found:
+            raise StorageError(f"{what}: '{source}' names no format, expected {forms[-1]!r}.{_FOREIGN}")
         if found not in forms:
-            kind = (found or "").rpartition(" ")[0]
+            kind = found.rpartition(" ")[0]
             hint = f" {_READERS[kind]} reads it." if kind in _READERS and not forms[-1].startswith(kind) else ""
-            raise StorageError(f"{what}: '{source}' is of format {shown(found or 'nothing')}, not {forms[-1]!r}.{hint}")
+            raise StorageError(f"{what}: '{source}' is of format {shown(found)}, not {forms[-1]!r}.{hint}")
         return _values(source, what, known, found)
 
 
-def _path_with_ending(path: str | Path, what: str) -> Path:
+def _path_with_ending(path: str | Path, what: str, hint: str = "") -> Path:
     found = path_of(path, what)
     if found.suffix.lower() not in ENDINGS:
-        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{found}'.")
+        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{found}'.{hint}")
     return found
 
 

@@ -142,7 +142,12 @@ class OutsideLight:
 
 
 class Epochs:
-    """Data set with an epoch, which persistent workers of a DataLoader receive too."""
+    """Data set with an epoch, which persistent workers of a DataLoader receive too.
+
+    An index may be (number, passes): a sample of so many epochs later, as ``tt.training.Batches`` asks for.
+    """
+
+    takes_passes = True
 
     def __init__(self) -> None:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
@@ -156,8 +161,9 @@ class Epochs:
         """
         raise NotImplementedError
 
-    def __getitem__(self, number: int) -> Any:
-        return self.sample(number, self.epoch)
+    def __getitem__(self, number: int | tuple[int, int]) -> Any:
+        number, passes = number if isinstance(number, tuple) else (number, 0)
+        return self.sample(number, self.epoch + passes)
 
     @property
     def epoch(self) -> int:

@@ -232,7 +232,8 @@ def _renderer(given: Any) -> TransientRenderer:
 def _checked_names(names: Sequence[str], average: bool) -> tuple[str, ...]:
     wanted = (names,) if isinstance(names, str) else tuple(names)
     if not wanted or len(set(wanted)) < len(wanted) or not set(wanted) <= set(LABELS):
-        raise ArgumentError(f"names: expected labels out of {', '.join(LABELS)}, each once, got {list(wanted)}.")
+        known = f"{', '.join(LABELS)} (in recipes first_return, too)"
+        raise ArgumentError(f"labels: expected some of {known}, each once, got {list(wanted)}.")
     numbered = [name for name in wanted if name in NUMBERED]
     if average and numbered:
         raise ArgumentError(

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import Numbers
+from torchtransient.checks import Numbers, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single, number_tensor
 from torchtransient.sensing.checks import (
@@ -473,7 +473,8 @@ class Afterpulsing(AddedCounts):
         super().__init__(grad)
         where = "Afterpulsing"
         if dead_time_s is None or (tau_s is None) == (delays is None):
-            raise UnitError(f"{where}: expected dead_time_s (0 for none), and either tau_s or delays, got others.")
+            got = f"{dead_time_s=}, {tau_s=} and delays={shown(delays)}"
+            raise UnitError(f"{where}: expected dead_time_s (0 for none), and either tau_s or delays, got {got}.")
         check_choice(counted_from, CountedFrom, "counted_from", where)
         self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", where)
         self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, where)

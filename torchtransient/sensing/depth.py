@@ -34,7 +34,7 @@ from torchtransient.sensing.checks import (
     check_transient,
     reals,
 )
-from torchtransient.sensing.responses import FWHM_PER_SIGMA, Response
+from torchtransient.sensing.responses import FWHM_PER_SIGMA, Response, kernel_of
 from torchtransient.sensing.time_convolution import Boundary, convolve_time
 from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
@@ -319,7 +319,7 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
 
 
 @in_single
-def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
+def range_deviation_m(response_fwhm_s: float, detections: Tensor | float) -> Tensor:
     """Cramer-Rao bound of the distance from one normal pulse without background: ``c sigma / (2 sqrt(N))``.
 
     The bins count as narrow beside the pulse; `crlb` knows bins, background, pile-up and other responses, and is this
@@ -327,7 +327,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
 
     Args:
         response_fwhm_s: full width at half maximum of the pulse in seconds.
-        detections: expected signal detections, any shape; infinite deviation at zero, NaN below.
+        detections: expected signal detections, a number or any shape; infinite deviation at zero, NaN below.
 
     Returns:
         Metres.
@@ -336,7 +336,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
         UnitError: for widths that are no seconds.
     """
     width = check_seconds(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True)
-    return 0.5 * SPEED_OF_LIGHT * width / FWHM_PER_SIGMA / detections.sqrt()
+    return 0.5 * SPEED_OF_LIGHT * width / FWHM_PER_SIGMA / torch.as_tensor(detections).sqrt()
 
 
 def _per_pixel(value: Tensor | float, histogram: Tensor, where: str, name: str) -> Tensor:
@@ -405,7 +405,7 @@ def ml_position(
     if axis is not None and axis.num_bins != bins:
         raise ShapeError(f"{where}: expected T = {axis.num_bins} as in the axis, got {bins}.")
     ratio = check_number(signal_to_background, "signal_to_background", where, open_low=True)
-    first, kernel = response.kernel(width)
+    first, kernel = kernel_of(response, width, "uniform")
     counts = histogram.to(torch.float64)
     with torch.no_grad():
         scores = log_matched_filter(counts, kernel, first, signal_to_background=ratio)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from datetime import timedelta
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler, Subset
 
 from torchtransient.checks import count, is_one_of, shown
 from torchtransient.errors import DeviceError, StorageError, UnitError
@@ -241,15 +241,14 @@ class Batches(Sampler[list[int]]):
         Args:
             step: number of the step.
         """
-        number, part = count(f"{_WHAT}: step", step, 0, UnitError), self.batch_size // self.world_size
-        first = number * self.batch_size + self.rank * part
-        return [self._sample(n) for n in range(first, first + part)]
+        return [self._sample(n) for n in self._draws(step)]
 
     def loader(self, data: Dataset[Any], *, workers: int = 0, renders: bool = False, **options: Any) -> DataLoader[Any]:
         """Make a DataLoader of these batches, which takes nothing from torch's own generator.
 
         An iterator of other loaders draws from it, so that a run that is resumed would have other random numbers than
-        one that was not.
+        one that was not. Data sets of ``tt.data`` with a seed, and a ``Subset`` of one, draw maps and noise anew in
+        each pass over the samples.
 
         Args:
             data: map-style data set of ``size`` samples.
@@ -270,7 +269,14 @@ class Batches(Sampler[list[int]]):
         own: dict[str, Any] = {"generator": self._of_workers()}
         if workers and renders:
             own |= {"multiprocessing_context": "spawn", "persistent_workers": True, "worker_init_fn": worker_init}
-        return DataLoader(data, batch_sampler=self, num_workers=workers, **{**own, **options})
+        whole: Any = data
+        places: Sequence[int] = range(self.size)
+        while type(whole) is Subset:
+            whole, places = whole.dataset, [whole.indices[place] for place in places]
+        own["batch_sampler"] = self
+        if getattr(whole, "takes_passes", False):
+            data, own["batch_sampler"] = whole, _WithPasses(self, places)
+        return DataLoader(data, num_workers=workers, **{**own, **options})
 
     def epoch(self, step: int) -> float:
         """Return the number of passes over the data set before a step.
@@ -333,6 +339,12 @@ class Batches(Sampler[list[int]]):
     def _order(self) -> dict[str, Any]:
         return {"size": self.size, "batch_size": self.batch_size, "seed": self.seed, "shuffle": self.shuffle}
 
+    def _draws(self, step: int) -> range:
+        """Numbers of this rank's samples at a step, counted over all passes."""
+        number, part = count(f"{_WHAT}: step", step, 0, UnitError), self.batch_size // self.world_size
+        first = number * self.batch_size + self.rank * part
+        return range(first, first + part)
+
     def _sample(self, number: int) -> int:
         epoch, place = divmod(number, self.size)
         if not self.shuffle:
@@ -340,3 +352,15 @@ class Batches(Sampler[list[int]]):
         if self._kept is None or self._kept[0] != epoch:
             self._kept = epoch, np.random.Generator(np.random.Philox([self.seed, epoch])).permutation(self.size)
         return int(self._kept[1][place])
+
+
+class _WithPasses(Sampler[list[tuple[int, int]]]):
+    """Batches of (number in the whole data set, passes over the samples before it)."""
+
+    def __init__(self, batches: Batches, places: Sequence[int]) -> None:
+        self.batches, self.places = batches, places
+
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
+        for step, samples in enumerate(self.batches, self.batches.step):
+            passes = [draw // self.batches.size for draw in self.batches._draws(step)]
+            yield list(zip([self.places[n] for n in samples], passes, strict=True))

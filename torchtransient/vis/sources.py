@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.array_files.array_file import read_npy, read_some
+from torchtransient.array_files.array_file import ENDINGS, read_npy, read_some
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.capture import computed
@@ -306,6 +306,7 @@ def read_any(path: Path) -> Any:
     """
     if path.suffix.lower() == ".npy":
         return read_npy(path, "picture")
-    form = str(read_some(path, "picture", "format".__eq__).get("format", ""))
+    arrays = path.suffix.lower() in ENDINGS
+    form = str(read_some(path, "picture", "format".__eq__).get("format", "")) if arrays else ""
     module, name = next(reader for kind, reader in _READERS.items() if form.startswith(kind))
     return getattr(importlib.import_module(module), name)(path)

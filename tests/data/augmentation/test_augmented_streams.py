@@ -6,8 +6,9 @@ import pickle
 
 import pytest
 import torch
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Subset
 
+import torchtransient as tt
 from support.stored_samples import folder
 from torchtransient.data import Augment, Augmented, AugmentedStream, Flip, TransientDataset, TransientStream
 from torchtransient.errors import ArgumentError, SceneError, UnitError
@@ -67,6 +68,31 @@ def test_an_epoch_of_a_data_set(data, workers):
     assert torch.equal(second, expected) and augmented.epoch == 1
     augmented.set_epoch(0)
     assert torch.equal(next(iter(loader))["depth"], first)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_batches_draw_maps_and_noise_anew_in_each_pass(data, workers):
+    noisy = TransientDataset(data, fields=["depth"], transform=torch.poisson, seed=1)
+    augmented = Augmented(noisy, Augment(Flip(p=0.5)), seed=1)
+    batches, read = tt.training.Batches(N, 4), {}
+    for _, batch in zip(range(6), batches.loader(augmented, workers=workers), strict=False):
+        for number, *found in zip(batch["index"].tolist(), batch["depth"], batch["measurement"], strict=True):
+            read.setdefault(number, []).append(found)
+    for passes in (0, 1):
+        for number, found in read.items():
+            expected = augmented.sample(number, passes)
+            assert torch.equal(found[passes][0], expected["depth"])
+            assert torch.equal(found[passes][1], expected["measurement"])
+    assert not all(torch.equal(first[0], second[0]) for first, second, *_ in read.values())
+
+
+def test_batches_of_a_part_draw_anew_too(data):
+    noisy = TransientDataset(data, fields=["depth"], transform=torch.poisson, seed=1)
+    part = Subset(Subset(noisy, range(2, N)), [3, 1])
+    batches = tt.training.Batches(2, 2, shuffle=False)
+    for passes, batch in zip(range(2), batches.loader(part), strict=False):
+        expected = [noisy.sample(number, passes)["measurement"] for number in (5, 3)]
+        assert torch.equal(batch["measurement"], torch.stack(expected))
 
 
 def test_samples_of_two_folders_with_one_number(data, tmp_path):

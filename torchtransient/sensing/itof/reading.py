@@ -135,7 +135,12 @@ class ItofNoise:
 
 @in_single
 def phase_noise_rad(
-    amplitude: Tensor, offset: Tensor, num_taps: int, *, read_noise_e: float = 0.0, readout: Readout = "single"
+    amplitude: Tensor | float,
+    offset: Tensor | float,
+    num_taps: int,
+    *,
+    read_noise_e: float = 0.0,
+    readout: Readout = "single",
 ) -> Tensor:
     """Standard deviation of the phase from amplitude and offset of an exposure, by shot and read noise.
 
@@ -145,7 +150,7 @@ def phase_noise_rad(
     phi) / A^2``; this is its root mean square.
 
     Args:
-        amplitude: electrons of an exposure; infinite deviation at zero.
+        amplitude: electrons of an exposure, a number or any shape; infinite deviation at zero.
         offset: electrons of an exposure, dark ones too; shapes broadcast.
         num_taps: number of phase steps N.
         read_noise_e: rms read noise in electrons of one tap in one exposure.
@@ -156,7 +161,7 @@ def phase_noise_rad(
     """
     read = check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
     check_choice(readout, Readout, "readout", "phase_noise_rad")
-    power = 2 * (offset + (1 if readout == "single" else 2) * read**2)
+    power = 2 * (torch.as_tensor(offset) + (1 if readout == "single" else 2) * read**2)
     return (power / check_count(num_taps, "num_taps", "phase_noise_rad")).sqrt() / amplitude
 
 

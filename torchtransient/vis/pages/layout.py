@@ -269,7 +269,7 @@ def _histogram(content: Content, curves: list[Any], log: bool) -> Any:
     slider = content.slider
     name = slider.name + (f" ({slider.unit})" if slider.unit else "")
     figure = bokeh.plotting.figure(
-        width=690, height=300, tools="xpan,xwheel_zoom,box_zoom,reset,save", active_drag=None, active_scroll=None,
+        width=665, height=300, tools="xpan,xwheel_zoom,box_zoom,reset,save", active_drag=None, active_scroll=None,
         x_axis_label=name, y_axis_label=content.quantity, y_axis_type="log" if log else "linear",
         name="histogram_log" if log else "histogram", visible=not log,
     )  # fmt: skip

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torchtransient.array_files.part_files import replacing
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.checks import Numbers, check_folder
-from torchtransient.errors import UnitError
+from torchtransient.errors import StorageError, UnitError
 from torchtransient.vis.pages.codes import PHASE, RATIO, Table, table_of
 from torchtransient.vis.pages.content import Content, Planes
 from torchtransient.vis.pages.kinds import binned, content_of
@@ -74,7 +74,7 @@ def view(
             `transient`, `phasor`, `slow_phasor`, `gated`, `rates` or `beats`; a Capture; a HiddenVolume; the path of a
             file of one of them; a tuple of two of a kind, shown as A, B and their difference; or a sequence of samples,
             of which one is shown at a time.
-        path: file to write the page to.
+        path: file to write the page to, which ends in .html.
         axis, rate_axis, frequencies: axes of tensors that do not know their own. Rates (C, R, T, H, W) need
             ``rate_axis``.
         title: heading of the page.
@@ -96,6 +96,8 @@ def view(
     if not max_megabytes >= 2:
         raise UnitError(f"view: expected max_megabytes of at least 2, as an empty page takes, got {max_megabytes!r}.")
     target = None if path is None else check_folder(path, "view")
+    if target is not None and target.suffix.lower() not in (".html", ".htm"):
+        raise StorageError(f"view: expected a name that ends in .html, got '{target}'. Pictures: docs/pictures.md.")
     heading = title or (Path(x).name if isinstance(x, str | Path) else "torchtransient")
     content = content_of(x, axis=axis, rate_axis=rate_axis, frequencies=frequencies, samples=samples)
     page = _page_of(content, heading, int(max_megabytes * 1e6))
