@@ -75,6 +75,14 @@ def test_kinds_of_pictures(folder, result, kind, more):
     assert Image.open("out.png").size[0] >= 4
 
 
+def test_captures_have_an_overview(folder):
+    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(1.0, 1.0), 4, kind="confocal")
+    tt.nlos.Capture(torch.rand(1, 9, 4, 4), tt.TimeAxis(2.0, 0.1, 9), scan).write("scan.h5")
+    done = run("picture", "scan.h5", "out.png")
+    assert done.exit_code == 0, done.output
+    assert Image.open("out.png").size[0] > 300
+
+
 @pytest.mark.slow
 def test_polarization_and_phasors_from_files(folder, result):
     import numpy as np

@@ -39,13 +39,18 @@ def command(result: Path, target: Path, kind: str, **options: Any) -> None:
 
 def _draw(kind: str, result: Path, target: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
-    from torchtransient.files.result_file import read_result
+    from torchtransient.files.result_file import Result
     from torchtransient.rendering.films import layout_of_output
+    from torchtransient.vis.sources import read_any, transient_of
 
     def overview() -> None:
-        from torchtransient.vis.sources import transient_of
-
-        held = read_result(result)
+        held = read_any(result)
+        if not isinstance(held, Result):
+            cube, axis = transient_of(held)
+            if axis is None:
+                raise click.UsageError(f"--kind overview needs a time axis, which {result.name} lacks; see --kind.")
+            tt.vis.plot_overview(cube, cube.sum(1), axis, path=target, pixel=options["pixel"], title=result.name)
+            return
         film = layout_of_output(held)
         if held.axis is None:
             what = "something else" if film is None else film.plural
