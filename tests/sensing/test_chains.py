@@ -69,3 +69,18 @@ def test_afterpulses_once():
     assert len(sensing.counting_chain(budget(), both).stages) == 2
     with pytest.raises(UnitError, match="afterpulses of its own"):
         sensing.counting_chain(budget(), both, afterpulsing=after)
+
+
+def test_the_likelihood_of_moved_detections_has_a_derivative_by_counts():
+    """Of a measurement that is learnt, say: counts without a detection are counts, too."""
+    axis = TimeAxis.from_seconds(0.0, 100 * PS, 8)
+    jitter = sensing.DetectionJitter(sensing.GaussianResponse(80 * PS), axis)
+    chain = sensing.Compose([sensing.SynchronousSPAD(500), jitter])
+    g = torch.Generator().manual_seed(0)
+    rate = 0.1 * torch.rand(1, 8, 1, 1, dtype=torch.float64, generator=g)
+    counts = torch.tensor([0.0, 3.0, 9.0, 0.0, 7.0, 1.0, 0.0, 2.0]).double().reshape(1, 8, 1, 1).requires_grad_()
+    step = 1e-3 * torch.rand(counts.shape, dtype=torch.float64, generator=g)
+    (slope,) = torch.autograd.grad(chain.log_prob(counts, rate).sum(), counts)
+    with torch.no_grad():
+        here, near, far = (float(chain.log_prob(counts + k * step, rate).sum()) for k in (0, 1, 2))
+    assert float((slope * step).sum()) == pytest.approx((4 * near - far - 3 * here) / 2, rel=1e-4)

@@ -89,6 +89,13 @@ def test_binary_code_against_a_sampled_correlation():
     np.testing.assert_allclose(code.evaluate(x).numpy(), 2 * overlap - 1, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["hamiltonian3", "hamiltonian4"])
+def test_hamiltonian_codes_walk_along_the_edges_of_a_cube(name):
+    """At every phase one tap is on its way, and the others are at +1 or -1."""
+    weights = CODES[name].evaluate((torch.arange(240, dtype=torch.float64) + 0.5) / 240)
+    assert ((weights.abs() < 1 - 1e-9).sum(0) == 1).all()
+
+
 @pytest.mark.parametrize("light_duty, gate_duty", [(0.2, 0.5), (0.4, 0.25)])
 def test_rectangles_of_unequal_duties_overlap_in_a_trapezoid(light_duty, gate_duty):
     """Its middle is the phase of the tap, zero of tap 0: the overlap falls as the middles of light and gate part."""

@@ -213,3 +213,18 @@ def test_the_derivative_of_coates_is_the_inverse_one(total):
     back = torch.autograd.functional.jacobian(lambda n: sensing.coates(n, 1000, 2.3).rate, counts)
     product = back.reshape(10, 10) @ there.reshape(10, 10)
     torch.testing.assert_close(product, torch.eye(10, dtype=torch.float64), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("dead_bins", [None, 2.3])
+def test_the_derivative_of_coates_in_bins_that_counted_nothing(dead_bins):
+    def rate(n):
+        return sensing.coates(n, 1000, dead_bins).rate.flatten()
+
+    counts = torch.tensor([0.0, 40.0, 0.0, 0.0, 9.0, 0.0]).double().reshape(1, 6, 1, 1)
+    found = torch.autograd.functional.jacobian(rate, counts).reshape(6, 6)
+    for k, column in enumerate(found.T):
+        step = torch.zeros_like(counts)
+        step[0, k] = 1e-2
+        # counts are not negative: one-sided, of second order
+        wanted = (4 * rate(counts + step) - rate(counts + 2 * step) - 3 * rate(counts)) / 2e-2
+        torch.testing.assert_close(column, wanted, rtol=1e-5, atol=1e-8)

@@ -129,9 +129,9 @@ def multinomial_log_prob(counts: Tensor, probabilities: Tensor, trials: int) -> 
     Returns:
         (..., H, W), float64.
     """
-    n, p = counts.detach().double(), probabilities.double()
+    n, p = counts.double(), probabilities.double()
     none, rest = trials - n.sum(TIME), 1 - p.sum(TIME)
-    value = (n * torch.where(n > 0, p, 1.0).log()).sum(TIME)
+    value = (n * torch.where((n > 0) | (p > 0), p, 1.0).log()).sum(TIME)
     # probabilities that add up to one leave rounding of either sign
     rest = rest.clamp_min(1e-18)
     counted = torch.lgamma(none + 1) + torch.lgamma(n + 1).sum(TIME)
