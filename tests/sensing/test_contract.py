@@ -150,6 +150,26 @@ def test_gradcheck_of_long_expectations(entry):
     derivatives_are_right(entry)
 
 
+# quantiles of light leap where there was none
+@together("entry", [e for e in ENTRIES if e.name != "EquiDepthHistogram"], lambda entry: entry.name)
+def test_derivatives_of_the_expectation_where_there_is_no_light(entry):
+    """In dark bins of lit pixels and in a dark pixel, along more light: differences are one-sided, of second order."""
+    g = torch.Generator().manual_seed(3)
+    x = entry.x()[:1]
+    x = torch.where(torch.rand(x.shape, generator=g) < 0.5, 0.0, x)
+    x[..., 0, 0] = 0
+    mean, along = Mean(entry.module()), torch.rand(x.shape, generator=g, dtype=torch.float64)
+    weights = [torch.rand(part.shape, generator=g, dtype=torch.float64) for part in mean(x)]
+
+    def totals(x):
+        return torch.stack([(part * w).sum().real for part, w in zip(mean(x), weights, strict=True)])
+
+    found = (torch.autograd.functional.jacobian(totals, x) * along).flatten(1).sum(1)
+    step = 1e-5
+    here, near, far = (totals(x + k * step * along).detach() for k in (0, 1, 2))
+    torch.testing.assert_close(found, (4 * near - far - 3 * here) / (2 * step), rtol=2e-3, atol=1e-5)
+
+
 # these look at their values
 not_transformed = {"FreeRunningSPAD": ("vmap", "grad"), "EquiDepthHistogram": ("vmap",)}
 

@@ -74,6 +74,9 @@ def test_second_derivatives_are_refused():
         (gradient,) = torch.autograd.grad(rate.square().sum(), x, create_graph=True)
         with pytest.raises(GradientError, match="second derivatives"):
             torch.autograd.grad(gradient.sum(), x)
+    # a gradient's derivative by its weights, which would be half of the tangent
+    with pytest.raises(GradientError, match="forward_ad"):
+        torch.autograd.functional.jvp(lambda rate: nonparalyzable_histogram(rate, 3.4), x.detach(), torch.ones_like(x))
 
 
 def test_dark_and_saturated_pixels():

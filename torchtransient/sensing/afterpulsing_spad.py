@@ -40,7 +40,7 @@ from torchtransient.sensing.dead_time.clocked import (
     subdivision_levels,
 )
 from torchtransient.sensing.dead_time.free_running import DARK, detections_per_period, rows_by_contrast
-from torchtransient.sensing.dead_time.once import once
+from torchtransient.sensing.dead_time.once import once_differentiable
 from torchtransient.sensing.dead_time.renewal import (
     BinResponse,
     ConstantLight,
@@ -148,7 +148,7 @@ class _Trapped(torch.autograd.Function):
         return torch.cat(found)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         loss, kept, source, part, x = ctx.saved_tensors
         found = []
@@ -257,8 +257,7 @@ class FreeRunningTrain:
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         loss = rate + lost
         kept = rate / loss
-        given = (once(x) for x in (loss, kept * back, source.flatten(1), self.part))
-        lines: Tensor = _Trapped.apply(*given, self.whole)  # type: ignore[no-untyped-call]
+        lines: Tensor = _Trapped.apply(loss, kept * back, source.flatten(1), self.part, self.whole)  # type: ignore[no-untyped-call]
         lines = lines.view_as(source)
         return lines[:, 0] / loss, lines * kept.unsqueeze(1)
 

@@ -28,7 +28,7 @@ from torch.autograd.functional import jvp
 
 from torchtransient.errors import TorchTransientError, UnitError
 from torchtransient.sensing.checks import one_number
-from torchtransient.sensing.dead_time.once import once
+from torchtransient.sensing.dead_time.once import once_differentiable
 
 ROOT3 = math.sqrt(3.0)
 _SERIES_BELOW = 1.0
@@ -666,7 +666,7 @@ class _StationaryPhases(torch.autograd.Function):
         return torch.cat(found)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         rate, part, pi = ctx.saved_tensors
         by_rate, by_part = [], torch.zeros_like(part)
@@ -696,5 +696,5 @@ def stationary_phases(rate: Tensor, part: Tensor, whole: int) -> Tensor:
     Raises:
         TorchTransientError: if neither the iteration nor the direct solution reaches its residual.
     """
-    pi: Tensor = _StationaryPhases.apply(once(rate), once(part), whole)  # type: ignore[no-untyped-call]
+    pi: Tensor = _StationaryPhases.apply(rate, part, whole)  # type: ignore[no-untyped-call]
     return pi
