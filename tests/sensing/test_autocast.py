@@ -8,6 +8,7 @@ import torch
 from support.sensing.all_entries import each
 from support.sensing.contract import parts
 from torchtransient import TimeAxis, sensing
+from torchtransient.errors import GradientError
 
 
 @pytest.mark.slow
@@ -23,7 +24,11 @@ def test_expectation_and_derivatives_are_those_outside(entry):
             value = parts(module.expected(light))[0]
         with torch.autocast("cpu", torch.bfloat16, enabled=backward):
             first = torch.autograd.grad(value.square().mean(), leaves, create_graph=True)
-            second = torch.autograd.grad(sum(g.square().mean() for g in first), leaves, allow_unused=True)
+            try:
+                second = torch.autograd.grad(sum(g.square().mean() for g in first), leaves, allow_unused=True)
+            except GradientError:
+                assert entry.name == "FreeRunningSPAD"
+                second = ()
         return [value, *first, *(g for g in second if g is not None)]
 
     wanted = run(False, False)
